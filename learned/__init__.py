@@ -1,0 +1,1 @@
+"""The learned side: networks that take tensors and return tensors (torch); see variational for the conventions."""
