@@ -1,0 +1,1 @@
+"""The subcommands of the command line, one a file; the table of names is in :mod:`cgsf.cli`."""
