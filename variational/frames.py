@@ -6,6 +6,7 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
+
 @dataclass(frozen=True, eq=False)
 class Frames:
     """Two rectified stereo pairs of equal size.
