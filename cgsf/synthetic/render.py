@@ -1,0 +1,248 @@
+"""Samples of stereo video: scene -> views -> pictures and truth."""
+
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cgsf.calibration import Calibration
+from cgsf.datasets.sample import Sample, Truth
+from cgsf.errors import InputError
+from cgsf.synthetic.caster import Caster
+from cgsf.synthetic.families import FAMILIES
+from cgsf.synthetic.scene import Scene, Soup
+from cgsf.synthetic.sensor import Sensor
+from cgsf.synthetic.shading import Illumination, Surfaces, shade_image
+from cgsf.synthetic.textures import TextureSource
+from cgsf.synthetic.truth import View, follow, seen
+
+_CENTRE = np.zeros((1, 2))
+_QUARTERS = np.array([[0.0, 0.0], [-0.125, -0.375], [0.375, -0.125], [0.125, 0.375], [-0.375, 0.125]])
+
+
+@dataclass(frozen=True)
+class RenderConfig:
+    """What may be asked of the renderer beside family, seed and size.
+
+    Parameters
+    ----------
+    photos : str or Path, optional
+        A folder of .jpg and .png pictures that become textures beside the procedural ones.
+    photo_share : float
+        How often a picture is taken where any texture will do, in [0, 1].
+    gloss : float
+        Factor on highlights and mirrors; 0 makes every surface look the same from everywhere.
+    shadows : bool
+        Cast shadows.
+    antialias : bool
+        Four rays a pixel at edges in place of one.
+    sensor : bool
+        Random camera: gains, vignetting, blur, noise, eight bits. Off: one ideal camera twice.
+    shutter : float
+        Motion blur: share of the frame interval that the shutter is open, in [0, 1). Truth stays that of the middle.
+    shutter_steps : int
+        Moments that are averaged when `shutter` > 0; time grows with it.
+    """
+
+    photos: str | Path | None = None
+    photo_share: float = 0.5
+    gloss: float = 1.0
+    shadows: bool = True
+    antialias: bool = True
+    sensor: bool = True
+    shutter: float = 0.0
+    shutter_steps: int = 5
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.shutter < 1:
+            raise InputError(f"shutter must be in [0, 1), got {self.shutter}")
+        if not 0 <= self.photo_share <= 1:
+            raise InputError(f"photo_share must be in [0, 1], got {self.photo_share}")
+        if self.shutter_steps < 2:
+            raise InputError(f"shutter_steps must be at least 2, got {self.shutter_steps}")
+
+
+class Renderer:
+    """Pictures and views of one scene at any time.
+
+    Parameters
+    ----------
+    scene : Scene
+    height, width : int
+        Image size in pixels.
+    config : RenderConfig
+    """
+
+    def __init__(self, scene: Scene, height: int, width: int, config: RenderConfig) -> None:
+        self.scene, self.height, self.width, self.config = scene, height, width, config
+        camera = scene.camera
+        self.intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy], float)
+        self.soup = Soup.of(scene)
+        textures = self.soup.textures
+        self.atlas = np.concatenate([texture.levels for texture in textures])
+        self.atlas_start = np.cumsum([0, *(len(texture.levels) for texture in textures[:-1])])
+        self.atlas_size = np.array([texture.size for texture in textures])
+        self.atlas_mirrored = np.array([texture.mirrored for texture in textures])
+        self.offsets = _QUARTERS if config.antialias else _CENTRE
+
+    def stereo(self, time: float) -> tuple[View, View, np.ndarray, np.ndarray]:
+        """Left and right view at `time` with their radiance, (H, W, 3) float32 each."""
+        points, normals = self.soup.at(self.scene, time)
+        light = self._illumination(points)
+        pose = self.scene.path.pose(time)
+        views, radiances = [], []
+        for shift in (0.0, self.scene.camera.baseline_m):
+            pose = pose.copy()
+            pose[0, 3] -= shift
+            corners = points @ pose[:3, :3].T + pose[:3, 3]
+            caster = Caster(corners, self.soup.culled, self.intrinsics, self.height, self.width)
+            inverse_depth, hit = caster.pattern(self.offsets)
+            surfaces = Surfaces(
+                caster.plane, points, normals, self.soup.uv, self.soup.surface, self.soup.material, self.soup.materials,
+                self.atlas, self.atlas_start, self.atlas_size, self.atlas_mirrored,
+            )  # fmt: skip
+            radiance = np.empty((self.height, self.width, 3), np.float32)
+            shade_image(surfaces, light, pose, self.intrinsics, self.offsets, hit, inverse_depth, radiance)
+            views.append(View(caster, pose, inverse_depth[..., 0].copy(), hit[..., 0].copy()))
+            radiances.append(radiance)
+        return views[0], views[1], radiances[0], radiances[1]
+
+    def exposed(self, time: float) -> tuple[View, View, np.ndarray, np.ndarray]:
+        """As `stereo`, with the radiance averaged over the time that the shutter is open."""
+        left, right, left_radiance, right_radiance = self.stereo(time)
+        if self.config.shutter > 0:
+            steps = self.config.shutter_steps
+            left_radiance, right_radiance = left_radiance / steps, right_radiance / steps
+            for offset in np.linspace(-0.5, 0.5, steps):
+                if abs(offset) > 1e-9 or steps % 2 == 0:
+                    _, _, more_left, more_right = self.stereo(time + self.config.shutter * offset)
+                    left_radiance += more_left / steps
+                    right_radiance += more_right / steps
+            if steps % 2 == 0:  # the middle was an extra moment
+                left_radiance *= steps / (steps + 1)
+                right_radiance *= steps / (steps + 1)
+        return left, right, left_radiance, right_radiance
+
+    def _illumination(self, points: np.ndarray) -> Illumination:
+        light, sky = self.scene.light, self.scene.sky
+        size = max(16, round(1.6 * float(np.sqrt(self.height * self.width))))
+        forward = light.target - light.position
+        distance = float(np.linalg.norm(forward))
+        forward = forward / distance
+        side = np.cross(np.eye(3)[np.argmin(np.abs(forward))], forward)
+        side /= np.linalg.norm(side)
+        pose = np.eye(4)
+        pose[:3, :3] = np.stack([side, np.cross(forward, side), forward])
+        pose[:3, 3] = -pose[:3, :3] @ light.position
+        focal = 0.5 * size * distance / light.radius
+        middle = 0.5 * (size - 1)
+        if self.config.shadows:
+            corners = points @ pose[:3, :3].T + pose[:3, 3]
+            caster = Caster(corners, np.zeros(len(points), bool), np.array([focal, focal, middle, middle]), size, size)
+            inverse_depth, _ = caster.pattern(_CENTRE)
+            with np.errstate(divide="ignore"):
+                depth = (1 / inverse_depth[..., 0]).astype(np.float32)
+        else:
+            depth = np.full((size, size), np.inf, np.float32)
+        bias = 2.0 * light.radius / size + 0.01
+        return Illumination(
+            light.position, light.color, light.falloff_m, light.above, light.below, sky.horizon, sky.zenith,
+            sky.cloud_strength, sky.haze_per_m, depth, pose, focal, bias, self.config.gloss,
+        )  # fmt: skip
+
+
+def truth_of(renderer: Renderer, left1: View, right1: View, left2: View, right2: View) -> Truth:
+    """Exact truth of two stereo pairs; see `Truth`. Flow is NaN for points that lie behind the second camera."""
+    scale = renderer.scene.camera.fx * renderer.scene.camera.baseline_m
+    pixels = np.moveaxis(np.indices(left1.hit.shape)[::-1], 0, -1)
+    in_left2, inverse_depth2 = follow(left1, left2)
+    in_right2, inverse_depth_right2 = follow(left1, right2)
+    visible_flow = seen(left2, in_left2, inverse_depth2)
+    objects = np.where(left1.hit >= 0, renderer.soup.objects[left1.hit], 0).astype(np.int32)
+    return Truth(
+        disparity1=(scale * left1.inverse_depth).astype(np.float32),
+        disparity2=(scale * inverse_depth2).astype(np.float32),
+        flow=(in_left2 - pixels).astype(np.float32),
+        disparity_left2=(scale * left2.inverse_depth).astype(np.float32),
+        visible_stereo=seen(right1, *follow(left1, right1)),
+        visible_flow=visible_flow,
+        visible_change=visible_flow & seen(right2, in_right2, inverse_depth_right2),
+        objects=objects,
+    )
+
+
+def make_scene(family: str, seed: int, height: int, width: int, config: RenderConfig | None = None) -> Scene:
+    """The scene of a seed; its geometry depends on the size only by the camera's focal length and aspect.
+
+    Raises
+    ------
+    InputError
+        For an unknown family, a negative seed or an image smaller than 16 x 16.
+    """
+    config = config or RenderConfig()
+    if family not in FAMILIES:
+        raise InputError(f"unknown family {family!r}; known are {', '.join(sorted(FAMILIES))}")
+    if seed < 0:
+        raise InputError(f"seed must not be negative, got {seed}")
+    if height < 16 or width < 16:
+        raise InputError(f"images must be at least 16 x 16 pixels, got {height} x {width}")
+    rng = np.random.default_rng([sorted(FAMILIES).index(family), seed])
+    source = TextureSource(np.random.default_rng([sorted(FAMILIES).index(family), seed, 1]), config.photos, config.photo_share)
+    return FAMILIES[family](rng, source, height, width)
+
+
+def make_video(family: str, seed: int, height: int, width: int, frames: int, **options: Any) -> list[Sample]:
+    """Stereo video with exact truth: ``frames - 1`` samples, each of two frames that follow each other.
+
+    Parameters
+    ----------
+    family : str
+        ``things`` or ``street``.
+    seed : int
+        Names the scene; the same seed, size and options give the same bytes everywhere.
+    height, width : int
+        Image size in pixels.
+    frames : int
+        Length of the video, at least 2.
+    **options
+        Fields of `RenderConfig`.
+
+    Returns
+    -------
+    list of Sample
+        The second pair of one sample is the first of the next.
+
+    Raises
+    ------
+    InputError
+        For arguments out of range and unknown options.
+    """
+    unknown = set(options) - {field.name for field in fields(RenderConfig)}
+    if unknown:
+        raise InputError(f"unknown option {sorted(unknown)[0]!r}; known are {', '.join(f.name for f in fields(RenderConfig))}")
+    if frames < 2:
+        raise InputError(f"a video has at least 2 frames, got {frames}")
+    config = RenderConfig(**options)
+    scene = make_scene(family, seed, height, width, config)
+    rng = np.random.default_rng([sorted(FAMILIES).index(family), seed, 2])
+    sensor = Sensor.random(rng, frames) if config.sensor else Sensor()
+    renderer = Renderer(scene, height, width, config)
+    calibration = Calibration.from_camera(scene.camera)
+    samples: list[Sample] = []
+    scale, before = 0.0, None
+    for frame in range(frames):
+        left, right, left_radiance, right_radiance = renderer.exposed(float(frame))
+        scale = scale or sensor.scale(left_radiance)
+        images = [sensor.develop(radiance, scale, side, frame, rng) for side, radiance in enumerate((left_radiance, right_radiance))]
+        if before is not None:
+            truth = truth_of(renderer, before[0], before[1], left, right)
+            name = f"{family}-{seed:06d}" + (f"/{frame - 1:03d}" if frames > 2 else "")
+            samples.append(Sample(name, *before[2], *images, calibration=calibration, truth=truth))
+        before = (left, right, images)
+    return samples
+
+
+def make_sample(family: str, seed: int, height: int, width: int, **options: Any) -> Sample:
+    """One sample, two stereo pairs with exact truth: `make_video` of two frames."""
+    return make_video(family, seed, height, width, 2, **options)[0]

@@ -1,0 +1,282 @@
+"""A scene: meshes with materials and rigid motions, lights, a sky and a camera that moves.
+
+World coordinates are those of the left camera's frame at time 0 up to the camera's own pose: metres, x right, y down,
+z forward. Time is counted in frames. Everything moves rigidly: a world point x of a part at time 0 is at
+``pivot + velocity t + R(spin t) (x - pivot)`` at time t.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from cgsf.synthetic.meshes import Mesh
+from cgsf.synthetic.textures import Texture
+from variational.camera import StereoCamera
+
+MATERIAL = np.dtype(
+    [
+        ("texture", np.int32),  # index into the scene's textures
+        ("detail", np.int32),  # index of the fine texture that is multiplied in
+        ("color", np.float32, (3, 4)),  # BGR of the surface = color @ (texture's BGR, 1)
+        ("uv", np.float32, (2, 3)),  # texture repeats = uv @ (surface metres, 1)
+        ("detail_scale", np.float32),  # repeats of the fine texture per metre
+        ("detail_strength", np.float32),
+        ("specular", np.float32),  # strength of the highlight
+        ("shininess", np.float32),  # its exponent
+        ("mirror", np.float32),  # share of the reflected surroundings at grazing angles
+        ("glow", np.float32),  # light of its own
+    ],
+    align=True,
+)
+
+
+@dataclass(frozen=True)
+class Material:
+    """How a surface looks.
+
+    Parameters
+    ----------
+    texture : Texture
+    color : ndarray (3, 4)
+        Affine colour change: BGR of the surface = ``color @ (b, g, r, 1)``, texture values in [0, 1].
+    scale : float
+        Texture repeats per metre.
+    turn : float
+        Angle of the texture on the surface, radians.
+    offset : tuple of two floats
+        Shift of the texture in repeats.
+    detail : Texture or None
+        Fine texture multiplied in, so that a surface near the eye is not a blur.
+    detail_scale, detail_strength : float
+        Repeats per metre; relative amplitude.
+    specular, shininess : float
+        Strength and exponent of the highlight, which moves with the eye.
+    mirror : float
+        Share of the reflected surroundings at grazing angles.
+    glow : float
+        Share of light of its own: lamps, signs.
+    """
+
+    texture: Texture
+    color: np.ndarray = field(default_factory=lambda: np.eye(3, 4))
+    scale: float = 1.0
+    turn: float = 0.0
+    offset: tuple[float, float] = (0.0, 0.0)
+    detail: Texture | None = None
+    detail_scale: float = 4.0
+    detail_strength: float = 0.0
+    specular: float = 0.0
+    shininess: float = 20.0
+    mirror: float = 0.0
+    glow: float = 0.0
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Rigid motion at a constant rate: `velocity` (3,) m/frame, `spin` (3,) rotation vector rad/frame about `pivot` (3,) m."""
+
+    pivot: np.ndarray
+    velocity: np.ndarray
+    spin: np.ndarray
+
+    def pose(self, time: float) -> np.ndarray:
+        """(4, 4) matrix from world points at time 0 to the same points at `time`."""
+        matrix = np.eye(4)
+        matrix[:3, :3] = Rotation.from_rotvec(np.asarray(self.spin, float) * time).as_matrix()
+        matrix[:3, 3] = self.pivot + np.asarray(self.velocity, float) * time - matrix[:3, :3] @ self.pivot
+        return matrix
+
+
+@dataclass(frozen=True)
+class CameraPath:
+    """The left camera over time: it drives along its own z axis and turns.
+
+    Parameters
+    ----------
+    position : ndarray (3,) m, at time 0
+    rotation : ndarray (3,)
+        Rotation vector from camera to world axes at time 0, radians.
+    velocity : ndarray (3,) m/frame
+        In the camera's own axes.
+    spin : ndarray (3,) rad/frame
+        In the camera's own axes.
+    """
+
+    position: np.ndarray
+    rotation: np.ndarray
+    velocity: np.ndarray
+    spin: np.ndarray
+
+    def pose(self, time: float) -> np.ndarray:
+        """(4, 4) matrix from world to camera coordinates at `time`; the velocity turns with the camera."""
+        start = Rotation.from_rotvec(self.rotation)
+        steps = max(1, round(8 * abs(time)))
+        middle = (np.arange(steps) + 0.5) * time / steps
+        heading = start * Rotation.from_rotvec(np.outer(middle, self.spin))
+        position = self.position + heading.apply(self.velocity).sum(0) * time / steps
+        turn = (start * Rotation.from_rotvec(np.asarray(self.spin) * time)).as_matrix().T
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = turn, -turn @ position
+        return matrix
+
+
+@dataclass(frozen=True)
+class Light:
+    """The light that casts shadows, at `position` (3,) m looking at `target` (3,) m, and the light from all around.
+
+    Parameters
+    ----------
+    position, target : ndarray (3,) m
+    radius : float
+        Radius in metres about `target` inside which shadows are cast.
+    color : ndarray (3,)
+        BGR radiance of the light.
+    falloff_m : float
+        Distance in metres at which the light has fallen to half; infinity for the sun.
+    above, below : ndarray (3,)
+        BGR light that comes from all around, on surfaces that face up and down.
+    """
+
+    position: np.ndarray
+    target: np.ndarray
+    radius: float
+    color: np.ndarray
+    falloff_m: float
+    above: np.ndarray
+    below: np.ndarray
+
+
+@dataclass(frozen=True)
+class Sky:
+    """What rays meet that meet nothing, and what mirrors show.
+
+    Parameters
+    ----------
+    horizon, zenith : ndarray (3,)
+        BGR radiance.
+    clouds : Texture
+    cloud_strength : float
+    haze_per_m : float
+        Share of the horizon's colour mixed in per metre of distance.
+    """
+
+    horizon: np.ndarray
+    zenith: np.ndarray
+    clouds: Texture
+    cloud_strength: float
+    haze_per_m: float = 0.0
+
+
+@dataclass
+class Part:
+    """One mesh in the world at time 0 with its material; `object_id` 0 stands still, parts of one object share an id."""
+
+    mesh: Mesh
+    material: Material
+    motion: Motion | None = None
+    object_id: int = 0
+
+
+@dataclass
+class Scene:
+    """Parts, light, sky and camera; grows by `add`, then is only read.
+
+    Parameters
+    ----------
+    camera : StereoCamera
+        Pixels of the image that is asked for.
+    path : CameraPath
+    light : Light
+    sky : Sky
+    parts : list of Part
+    """
+
+    camera: StereoCamera
+    path: CameraPath
+    light: Light
+    sky: Sky
+    parts: list[Part] = field(default_factory=list)
+
+    def add(self, mesh: Mesh, material: Material, motion: Motion | None = None, object_id: int = 0) -> None:
+        """Put a mesh, given in world coordinates at time 0, into the scene."""
+        self.parts.append(Part(mesh, material, motion, object_id))
+
+
+@dataclass(frozen=True)
+class Soup:
+    """All triangles of a scene in single arrays, as the kernels read them.
+
+    Parameters
+    ----------
+    points, normals : ndarray (N, 3, 3) float64
+        World coordinates at time 0.
+    uv : ndarray (N, 3, 2) float64
+    surface : ndarray (N,) int64
+        Smooth surface that the triangle belongs to, unique over the scene.
+    part, material : ndarray (N,) int64
+    culled : ndarray (N,) bool
+    objects : ndarray (N,) int32
+    materials : ndarray of MATERIAL
+    textures : list of Texture
+    """
+
+    points: np.ndarray
+    normals: np.ndarray
+    uv: np.ndarray
+    surface: np.ndarray
+    part: np.ndarray
+    material: np.ndarray
+    culled: np.ndarray
+    objects: np.ndarray
+    materials: np.ndarray
+    textures: list[Texture]
+
+    @classmethod
+    def of(cls, scene: Scene) -> "Soup":
+        """The scene's parts, joined."""
+        parts = scene.parts
+        counts = [len(part.mesh.points) for part in parts]
+        of_part = np.repeat(np.arange(len(parts)), counts)
+        offsets = np.cumsum([0, *(int(part.mesh.surface.max()) + 1 for part in parts[:-1])])
+        unique = {id(part.material): part.material for part in parts}
+        place = {key: index for index, key in enumerate(unique)}
+        textures: dict[int, Texture] = {id(scene.sky.clouds): scene.sky.clouds}
+        for material in unique.values():
+            for texture in (material.texture, material.detail):
+                if texture is not None:
+                    textures.setdefault(id(texture), texture)
+        slot = {key: index for index, key in enumerate(textures)}
+        records = np.zeros(len(unique), MATERIAL)
+        for record, material in zip(records, unique.values(), strict=True):
+            cos, sin = np.cos(material.turn) * material.scale, np.sin(material.turn) * material.scale
+            record["texture"] = slot[id(material.texture)]
+            record["detail"] = slot[id(material.detail or material.texture)]
+            record["color"] = material.color
+            record["uv"] = [[cos, -sin, material.offset[0]], [sin, cos, material.offset[1]]]
+            record["detail_strength"] = material.detail_strength if material.detail is not None else 0.0
+            for name in ("detail_scale", "specular", "shininess", "mirror", "glow"):
+                record[name] = getattr(material, name)
+        return cls(
+            np.concatenate([part.mesh.points for part in parts]),
+            np.concatenate([part.mesh.normals for part in parts]),
+            np.concatenate([part.mesh.uv for part in parts]),
+            np.concatenate([part.mesh.surface + offset for part, offset in zip(parts, offsets, strict=True)]),
+            of_part,
+            np.array([place[id(part.material)] for part in parts])[of_part],
+            np.array([part.mesh.closed for part in parts])[of_part],
+            np.array([part.object_id for part in parts], np.int32)[of_part],
+            records,
+            list(textures.values()),
+        )
+
+    def at(self, scene: Scene, time: float) -> tuple[np.ndarray, np.ndarray]:
+        """World coordinates of the corners and their normals at `time`, (N, 3, 3) each."""
+        poses = np.stack([np.eye(4) if part.motion is None else part.motion.pose(time) for part in scene.parts])
+        points, normals = self.points.copy(), self.normals.copy()
+        moving = np.array([part.motion is not None for part in scene.parts])[self.part]
+        if moving.any():
+            turn, shift = poses[self.part[moving], :3, :3], poses[self.part[moving], None, :3, 3]
+            points[moving] = np.einsum("nij,ncj->nci", turn, points[moving]) + shift
+            normals[moving] = np.einsum("nij,ncj->nci", turn, normals[moving])
+        return points, normals

@@ -1,0 +1,1 @@
+from cgsf.synthetic.things import things as street  # noqa
