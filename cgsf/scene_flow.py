@@ -40,6 +40,8 @@ class SceneFlow:
         Takes points of the standing world from left1's coordinates to left2's: metres with a calibration.
     loss : ndarray (H, W) float32, optional
         The consistency energy of each pixel.
+    backward_flow : ndarray (H, W, 2) float32, optional
+        Flow left2 -> left1 on left2's grid, which the visible mask comes from; it is not saved.
     calibration : Calibration, optional
         Needed by `depth`, `points` and `motion`.
     method : str
@@ -61,6 +63,7 @@ class SceneFlow:
     moving: np.ndarray | None = None
     camera_motion: np.ndarray | None = None
     loss: np.ndarray | None = None
+    backward_flow: np.ndarray | None = None
     calibration: Calibration | None = None
     method: str = ""
     seconds: dict[str, float] = field(default_factory=dict)

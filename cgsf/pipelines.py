@@ -1,0 +1,193 @@
+"""Methods by name, and the one function that runs any of them.
+
+A method is a function ``(frames, config, camera, progress) -> SceneFlow``: frames are validated, the camera may be
+None, progress may be None or ``progress(stage, fraction)``. Its settings are a frozen dataclass that presets fill.
+"""
+
+from __future__ import annotations
+
+import importlib
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cgsf.calibration import Calibration
+from cgsf.config import from_table, read_preset
+from cgsf.errors import InputError
+from cgsf.intake import to_frames, warn_of_oddities
+from cgsf.scene_flow import SceneFlow
+from variational.camera import StereoCamera
+from variational.frames import Frames
+
+Progress = Callable[[str, float], None]
+
+
+@dataclass(frozen=True)
+class Method:
+    """Where a method is found; nothing is imported before it is used.
+
+    Parameters
+    ----------
+    function : str
+        ``module:function`` with the signature above.
+    summary : str
+        One line for people.
+    section : str or None
+        The table of a preset that holds its settings.
+    config : str or None
+        ``module:Class``, the dataclass of its settings.
+    fixed : dict
+        Settings that make this method of several that share a function; a preset cannot change them.
+    """
+
+    function: str
+    summary: str
+    section: str | None = None
+    config: str | None = None
+    fixed: tuple[tuple[str, Any], ...] = ()
+
+
+def _composition(flow: str, filtered: bool) -> Method:
+    text = f"OpenCV: semi-global matching{', filtered,' if filtered else ''} and {flow} flow"
+    fixed = (("flow", flow), ("filtered", filtered))
+    return Method("cgsf.baselines:compose", text, "opencv", "cgsf.baselines:CompositionConfig", fixed)
+
+
+METHODS: dict[str, Method] = {
+    "variational": Method(
+        "cgsf.pipelines:solve_variational", "coarse-to-fine energy minimisation", "variational",
+        "variational.solver:SolverConfig",
+    ),
+    "opencv": _composition("dis", False),
+    **{f"opencv-{flow}": _composition(flow, False) for flow in ("deepflow", "rlof", "farneback")},
+    **{f"opencv-wls-{flow}": _composition(flow, True) for flow in ("dis", "deepflow", "rlof", "farneback")},
+    "zero": Method("cgsf.baselines:nothing", "zero everywhere"),
+}  # fmt: skip
+
+
+def estimate(
+    left1: np.ndarray,
+    right1: np.ndarray,
+    left2: np.ndarray,
+    right2: np.ndarray,
+    method: str = "variational",
+    calibration: Calibration | StereoCamera | str | Path | None = None,
+    preset: str = "default",
+    progress: Progress | None = None,
+) -> SceneFlow:
+    """Scene flow of two rectified stereo pairs.
+
+    Parameters
+    ----------
+    left1, right1, left2, right2 : ndarray (H, W) or (H, W, c)
+        uint8, uint16, or floating point in [0, 1]; grey, or colour in BGR order; alpha is left out.
+    method : str
+        A key of `METHODS`.
+    calibration : Calibration, StereoCamera, path of a calibration file, or None
+        With it, depth and motion in metres, and whatever the method makes of a camera.
+    preset : str
+        A preset's name, or the path of a ``.toml`` file.
+    progress : callable, optional
+        Called with the stage's name and the fraction done.
+
+    Returns
+    -------
+    SceneFlow
+        In pixels; ``seconds["total"]`` is the time of the solving alone.
+
+    Raises
+    ------
+    InputError
+        If the images, the method, the preset or the calibration cannot be used.
+
+    Examples
+    --------
+    >>> import cgsf, cv2
+    >>> images = [cv2.imread(f"{name}.png") for name in ("left1", "right1", "left2", "right2")]  # doctest: +SKIP
+    >>> flow = cgsf.estimate(*images).flow  # doctest: +SKIP
+    """
+    return solve((left1, right1, left2, right2), method, load_config(method, preset), calibration, progress)
+
+
+def solve(
+    images: Sequence[np.ndarray],
+    method: str,
+    config: Any,
+    calibration: Calibration | StereoCamera | str | Path | None = None,
+    progress: Progress | None = None,
+) -> SceneFlow:
+    """`estimate` with a configuration that is loaded already."""
+    if isinstance(calibration, str | Path):
+        calibration = Calibration.read(calibration)
+    elif calibration is not None and not isinstance(calibration, Calibration):
+        calibration = Calibration.from_camera(calibration)
+    frames = to_frames(images)
+    warn_of_oddities(frames)
+    function = _load(find_method(method).function)
+    start = time.perf_counter()
+    result: SceneFlow = function(frames, config, None if calibration is None else calibration.camera(), progress)
+    total = time.perf_counter() - start
+    return replace(result, method=method, calibration=calibration, seconds={**result.seconds, "total": total})
+
+
+def find_method(name: str) -> Method:
+    """The entry of `METHODS`; `InputError` with the names that exist for another."""
+    if name not in METHODS:
+        raise InputError(f"unknown method {name!r}; there are {', '.join(METHODS)}")
+    return METHODS[name]
+
+
+def load_config(method: str, preset: str = "default") -> Any:
+    """The settings of a method under a preset: an instance of its dataclass, None if it has no settings.
+
+    Raises
+    ------
+    InputError
+        For an unknown method or preset, a table that belongs to no method, and settings that do not fit.
+    """
+    entry = find_method(method)
+    tables = read_preset(preset)
+    sections = {other.section for other in METHODS.values() if other.section} | {"description"}
+    unknown = [key for key in tables if key not in sections]
+    if unknown:
+        raise InputError(f"preset {preset}: unknown table {unknown[0]!r}; there are {', '.join(sorted(sections))}")
+    if entry.config is None or entry.section is None:
+        return None
+    return from_table(_load(entry.config), tables.get(entry.section, {}) | dict(entry.fixed), entry.section)
+
+
+def consistency_loss(frames: Frames, result: SceneFlow) -> np.ndarray:
+    """The paper's consistency energy of each pixel, (H, W) float32, at a result."""
+    from variational.energy import Energy, EnergyConfig
+
+    energy = Energy(frames, EnergyConfig(), backward_flow=result.backward_flow)
+    loss, _ = energy.value_and_gradient(result.state())
+    return np.asarray(loss, np.float32)
+
+
+def solve_variational(frames: Frames, config: Any, camera: StereoCamera | None, progress: Progress | None) -> SceneFlow:
+    """The handwritten solver; keeps the state that it started from."""
+    from variational.solver import solve as minimise
+
+    solution = minimise(frames, config, camera, progress)
+    initial = SceneFlow.from_state(solution.initial_state, np.ones(frames.shape, bool), method="initial state")
+    return SceneFlow.from_state(
+        solution.state,
+        solution.visible,
+        confidence=solution.confidence,
+        moving=solution.moving,
+        camera_motion=solution.camera_motion,
+        backward_flow=solution.backward_flow,
+        seconds=dict(solution.seconds),
+        record={"reason": solution.reason, "history": solution.history},
+        initial=initial,
+    )
+
+
+def _load(place: str) -> Any:
+    module, name = place.split(":")
+    return getattr(importlib.import_module(module), name)
