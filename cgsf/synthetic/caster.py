@@ -13,7 +13,7 @@ Rays are sorted by the pixel that they fall in, so that a triangle visits only t
 import math
 
 import numpy as np
-from numba import njit
+from variational.jit import rowwise
 
 #: Nothing nearer than this many metres is seen.
 NEAR_M = 0.05
@@ -21,7 +21,7 @@ NEAR_M = 0.05
 EDGE_SLACK = 1e-9
 
 
-@njit(cache=True)
+@rowwise
 def setup_triangles(
     corners: np.ndarray, culled: np.ndarray, intrinsics: np.ndarray, height: int, width: int,
     plane: np.ndarray, bounds: np.ndarray,
@@ -80,7 +80,7 @@ def setup_triangles(
         bounds[n, 3] = min(int(math.floor(min(high_y, height - 1.0) + 0.5)), height - 1)
 
 
-@njit(cache=True)
+@rowwise
 def cast(
     plane: np.ndarray, bounds: np.ndarray, x: np.ndarray, y: np.ndarray, start: np.ndarray, width: int,
     inverse_depth: np.ndarray, hit: np.ndarray,
@@ -131,7 +131,7 @@ def cast(
                         hit[ray] = n
 
 
-@njit(cache=True)
+@rowwise
 def sort_rays(x: np.ndarray, y: np.ndarray, height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
     """Rays sorted by pixel; those outside the image (or NaN) are left out.
 

@@ -61,8 +61,15 @@ def join(meshes: Sequence[Mesh]) -> Mesh:
     )
 
 
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    out = np.empty(np.broadcast_shapes(a.shape, b.shape))
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        out[..., i] = a[..., j] * b[..., k] - a[..., k] * b[..., j]
+    return out
+
+
 def _flat_normals(points: np.ndarray) -> np.ndarray:
-    normal = np.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0])
+    normal = _cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0])
     normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
     return np.repeat(normal[:, None], 3, axis=1)
 
@@ -70,7 +77,7 @@ def _flat_normals(points: np.ndarray) -> np.ndarray:
 def _outwards(mesh: Mesh) -> Mesh:
     """The closed mesh with its corners ordered so that the enclosed volume is positive and normals to match."""
     points = mesh.points
-    volume = np.einsum("ni,ni->", points[:, 0], np.cross(points[:, 1], points[:, 2]))
+    volume = np.einsum("ni,ni->", points[:, 0], _cross(points[:, 1], points[:, 2]))
     if volume < 0:
         mesh = replace(mesh, points=points[:, ::-1], normals=mesh.normals[:, ::-1], uv=mesh.uv[:, ::-1])
     geometric = _flat_normals(mesh.points)
@@ -87,8 +94,8 @@ def polygon(corners: np.ndarray, uv: np.ndarray | None = None) -> Mesh:
     if uv is None:
         along = corners[1] - corners[0]
         along = along / np.linalg.norm(along)
-        normal = np.cross(along, corners[2] - corners[0])
-        across = np.cross(normal / np.linalg.norm(normal), along)
+        normal = _cross(along, corners[2] - corners[0])
+        across = _cross(normal / np.linalg.norm(normal), along)
         uv = np.stack([(corners - corners[0]) @ along, (corners - corners[0]) @ across], -1)
     count = len(corners)
     if count <= 4:  # convex in every use: a fan from the first corner needs no extra vertex
@@ -113,7 +120,7 @@ def grid(points: np.ndarray, uv: np.ndarray, smooth: bool = True) -> Mesh:
             for end in (0, -1):
                 index[axis] = end
                 difference[tuple(index)] = ring
-    normal = np.cross(along, across)
+    normal = _cross(along, across)
     length = np.linalg.norm(normal, axis=-1, keepdims=True)
     if not smooth or (length < 1e-12).all():
         normal, length = np.zeros_like(normal), np.zeros_like(length)
@@ -128,25 +135,34 @@ def grid(points: np.ndarray, uv: np.ndarray, smooth: bool = True) -> Mesh:
     normals = np.where(np.linalg.norm(normals, axis=-1, keepdims=True) < 0.5, flat, normals)
     cells = np.repeat(np.arange(len(triangles) // 2), 2)
     surface = np.zeros(len(triangles), np.int64) if smooth else cells
-    area = np.linalg.norm(np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=-1)
+    area = np.linalg.norm(_cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=-1)
     keep = area > 1e-14  # a pole's cells degenerate to one triangle
     return Mesh(triangles[keep], normals[keep], corners(uv)[keep], surface[keep])
 
 
+_CUBE = np.array(  # faces, corners in order round each
+    [
+        [(-1, -1, -1), (1, -1, -1), (1, 1, -1), (-1, 1, -1)],
+        [(1, -1, 1), (-1, -1, 1), (-1, 1, 1), (1, 1, 1)],
+        [(-1, -1, 1), (-1, -1, -1), (-1, 1, -1), (-1, 1, 1)],
+        [(1, -1, -1), (1, -1, 1), (1, 1, 1), (1, 1, -1)],
+        [(-1, -1, 1), (1, -1, 1), (1, -1, -1), (-1, -1, -1)],
+        [(-1, 1, -1), (1, 1, -1), (1, 1, 1), (-1, 1, 1)],
+    ],
+    float,
+)
+_HALVES = np.array([[0, 2, 1], [0, 3, 2]])
+
+
 def box(size: Sequence[float]) -> Mesh:
-    """A box of `size` (x, y, z) m about the origin."""
-    x, y, z = np.asarray(size, float) / 2
-    faces = []
-    for corners in (
-        [(-x, -y, -z), (x, -y, -z), (x, y, -z), (-x, y, -z)],
-        [(x, -y, z), (-x, -y, z), (-x, y, z), (x, y, z)],
-        [(-x, -y, z), (-x, -y, -z), (-x, y, -z), (-x, y, z)],
-        [(x, -y, -z), (x, -y, z), (x, y, z), (x, y, -z)],
-        [(-x, -y, z), (x, -y, z), (x, -y, -z), (-x, -y, -z)],
-        [(-x, y, -z), (x, y, -z), (x, y, z), (-x, y, z)],
-    ):
-        faces.append(polygon(np.array(corners)))
-    return _outwards(join(faces))
+    """A box of `size` (x, y, z) m about the origin; the texture stands upright on its four sides."""
+    faces = _CUBE * (np.asarray(size, float) / 2)
+    width = np.linalg.norm(faces[:, 1] - faces[:, 0], axis=-1)
+    height = np.linalg.norm(faces[:, 2] - faces[:, 1], axis=-1)
+    zero = np.zeros(6)
+    uv = np.stack([np.stack([zero, width, width, zero], 1), np.stack([zero, zero, height, height], 1)], -1)
+    points = faces[:, _HALVES].reshape(12, 3, 3)
+    return Mesh(points, _flat_normals(points), uv[:, _HALVES].reshape(12, 3, 2), np.repeat(np.arange(6), 2), True)
 
 
 def hull(points: np.ndarray) -> Mesh:
@@ -161,8 +177,8 @@ def hull(points: np.ndarray) -> Mesh:
         normal = shape.equations[surface.ravel() == index][0, :3]
         along = part[0, 1] - part[0, 0]
         along = along / np.linalg.norm(along)
-        uv = np.stack([(part - middle) @ along, (part - middle) @ np.cross(normal, along)], -1)
-        inward = np.einsum("ni,i->n", np.cross(part[:, 1] - part[:, 0], part[:, 2] - part[:, 0]), normal) < 0
+        uv = np.stack([(part - middle) @ along, (part - middle) @ _cross(normal, along)], -1)
+        inward = np.einsum("ni,i->n", _cross(part[:, 1] - part[:, 0], part[:, 2] - part[:, 0]), normal) < 0
         part, uv = np.where(inward[:, None, None], part[:, ::-1], part), np.where(inward[:, None, None], uv[:, ::-1], uv)
         normals = np.broadcast_to(normal, part.shape).copy()
         meshes.append(Mesh(part, normals, uv, np.zeros(len(part), np.int64), True))
@@ -253,11 +269,11 @@ def tube(path: np.ndarray, radius: float, steps: int = 8) -> Mesh:
         tangent[0] = tangent[-1] = path[1] - path[-2]
     tangent /= np.maximum(np.linalg.norm(tangent, axis=-1, keepdims=True), 1e-12)
     side = np.zeros_like(path)
-    side[0] = np.cross(tangent[0], np.eye(3)[np.argmin(np.abs(tangent[0]))])
+    side[0] = _cross(tangent[0], np.eye(3)[np.argmin(np.abs(tangent[0]))])
     for i in range(1, len(path)):  # the frame is carried along, so that it does not twist
         side[i] = side[i - 1] - tangent[i] * (side[i - 1] @ tangent[i])
     side /= np.maximum(np.linalg.norm(side, axis=-1, keepdims=True), 1e-12)
-    up = np.cross(tangent, side)
+    up = _cross(tangent, side)
     angle = np.linspace(0, 2 * np.pi, steps + 1)
     angle[-1] = 0.0
     ring = side[:, None] * np.cos(angle)[:, None] + up[:, None] * np.sin(angle)[:, None]

@@ -102,8 +102,7 @@ class Renderer:
                 caster.plane, points, normals, self.soup.uv, self.soup.surface, self.soup.material, self.soup.materials,
                 self.atlas, self.atlas_start, self.atlas_size, self.atlas_mirrored,
             )  # fmt: skip
-            radiance = np.empty((self.height, self.width, 3), np.float32)
-            shade_image(surfaces, light, pose, self.intrinsics, self.offsets, hit, inverse_depth, radiance)
+            radiance = shade_image(surfaces, light, pose, self.intrinsics, self.offsets, hit, inverse_depth)
             views.append(View(caster, pose, inverse_depth[..., 0].copy(), hit[..., 0].copy()))
             radiances.append(radiance)
         return views[0], views[1], radiances[0], radiances[1]

@@ -7,7 +7,7 @@ corners where another camera has them, at another time, is the same point there.
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
+from variational.jit import rowwise
 
 from cgsf.synthetic.caster import NEAR_M, Caster
 
@@ -31,7 +31,7 @@ class View(NamedTuple):
     hit: np.ndarray
 
 
-@njit(cache=True)
+@rowwise
 def _follow(
     hit: np.ndarray, inverse_depth: np.ndarray, plane: np.ndarray, corners: np.ndarray, turn: np.ndarray,
     intrinsics: np.ndarray, place: np.ndarray, there: np.ndarray,
