@@ -1,0 +1,195 @@
+"""The consistency energy and its analytic gradient: the gradient oracle that everything else uses.
+
+``L = w_pd L_pd + w_pf L_pf + w_df L_df + w_s L_s`` per pixel, the energy its sum; formulas stand in :mod:`variational.terms`,
+the table formula -> function in docs/energy.md. Defaults are the paper's.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from variational.frames import Frames
+from variational.jit import band_edges, parallel, prange, total
+from variational.state import check_state
+from variational.terms.coupling import coupling_band, scatter_band
+from variational.terms.photometric import padded_planes, photometric_band, window_overlap
+from variational.terms.smoothness import edge_weights, smoothness_band
+from variational.terms.visibility import flow_planes, visible_band
+
+
+@dataclass(frozen=True)
+class EnergyConfig:
+    """Weights and options of the energy; a term of weight zero is switched off and costs nothing.
+
+    Parameters
+    ----------
+    stereo_weight : float
+        w_pd of both stereo pairs' photometric error.
+    flow_weight : float
+        w_pf of the photometric error of left1 and left2.
+    coupling_weight : float
+        w_df of ``|D1 + C - D2(p + F)|``, per pixel of disparity.
+    smoothness_weight : float
+        w_s of the first differences, per pixel; raising it flattens.
+    ssim_share : float
+        alpha in [0, 1]: structural similarity against absolute difference in the photometric error.
+    edge_sharpness : float
+        Factor inside the smoothness term's exponential; raising it frees more of the image's edges.
+    visible_relative, visible_absolute : float
+        w1 and w2 (square pixels) of the forward-backward check; raising them calls more pixels visible.
+    drop_outside : bool
+        Leave out photometric errors of pixels whose match lies outside the other image.
+    charbonnier_intensity, charbonnier_px : float
+        eps of the Charbonnier penalty in the photometric terms (intensity) and in coupling and smoothness (pixels);
+        0 is the plain absolute value, second-order minimisers need more.
+    """
+
+    stereo_weight: float = 1.0
+    flow_weight: float = 1.0
+    coupling_weight: float = 1.0
+    smoothness_weight: float = 0.1
+    ssim_share: float = 0.85
+    edge_sharpness: float = 1.0
+    visible_relative: float = 0.01
+    visible_absolute: float = 0.05
+    drop_outside: bool = False
+    charbonnier_intensity: float = 0.0
+    charbonnier_px: float = 0.0
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if not (np.isfinite(value) and value >= 0):
+                raise ValueError(f"EnergyConfig.{field.name} must be finite and not negative, got {value}")
+        if self.ssim_share > 1:
+            raise ValueError(f"EnergyConfig.ssim_share must be in [0, 1], got {self.ssim_share}")
+
+
+@parallel
+def _evaluate(state: np.ndarray, left1: np.ndarray, right1: np.ndarray, left2: np.ndarray, right2: np.ndarray,
+              left2_source: np.ndarray, edges1: np.ndarray, edges2: np.ndarray, backward: np.ndarray, overlap_y: np.ndarray,
+              overlap_x: np.ndarray, visible1: np.ndarray, visible2: np.ndarray, find_visible: bool, visible: np.ndarray,
+              weights: tuple[float, float, float, float], alpha: float, eps_intensity: float, eps_px: float, w1: float,
+              w2: float, drop_outside: bool, bands: np.ndarray, loss: np.ndarray, gradient: np.ndarray, pull: np.ndarray,
+              reach: np.ndarray, with_gradient: bool) -> None:
+    """Add every term to `loss` and `gradient`. Three sweeps, because a band's stencil reads its neighbours' visibility."""
+    w_stereo, w_flow, w_coupling, w_smooth = weights
+    for band in prange(bands.size - 1):
+        first, last = bands[band], bands[band + 1]
+        loss[first:last] = 0
+        gradient[:, first:last] = 0
+        if find_visible:
+            visible_band(state[3], state[4], backward, w1, w2, first, last, visible)
+        if w_smooth > 0:
+            for channel in range(5):
+                smoothness_band(state[channel], edges2 if channel == 1 else edges1, w_smooth, eps_px, first, last, loss,
+                                gradient[channel])
+        if w_stereo > 0:
+            photometric_band(left1, right1, state[0], None, -1.0, visible1, overlap_y, overlap_x, w_stereo, alpha,
+                             eps_intensity, drop_outside, first, last, loss, gradient[0], gradient[0], with_gradient)
+            photometric_band(left2, right2, state[1], None, -1.0, visible2, overlap_y, overlap_x, w_stereo, alpha,
+                             eps_intensity, drop_outside, first, last, loss, gradient[1], gradient[1], with_gradient)
+    for band in prange(bands.size - 1):
+        first, last = bands[band], bands[band + 1]
+        if w_flow > 0:
+            photometric_band(left1, left2_source, state[3], state[4], 1.0, visible, overlap_y, overlap_x, w_flow, alpha,
+                             eps_intensity, drop_outside, first, last, loss, gradient[3], gradient[4], with_gradient)
+        if w_coupling > 0:
+            coupling_band(state, state[1].reshape(-1), visible, w_coupling, eps_px, first, last, loss, gradient, pull, reach)
+    if w_coupling > 0 and with_gradient:
+        for band in prange(bands.size - 1):
+            scatter_band(state[3], state[4], pull, reach, bands[band], bands[band + 1], gradient[1])
+
+
+class Energy:
+    """The energy of one set of frames, at one resolution, as a function of the state.
+
+    Parameters
+    ----------
+    frames : Frames
+        The four images.
+    config : EnergyConfig
+        Weights and options.
+    backward_flow : np.ndarray or None
+        ``(H, W, 2)`` flow left2 -> left1 on left2's grid, in pixels, held fixed; None calls every pixel visible.
+    visible_stereo1, visible_stereo2 : np.ndarray or None
+        ``(H, W)`` bool: left1's (left2's) pixels that are seen in right1 (right2); None calls every pixel visible.
+
+    Raises
+    ------
+    ValueError
+        In one line, where a shape is not the frames'.
+    """
+
+    def __init__(self, frames: Frames, config: EnergyConfig = EnergyConfig(), backward_flow: np.ndarray | None = None,
+                 visible_stereo1: np.ndarray | None = None, visible_stereo2: np.ndarray | None = None) -> None:
+        self.frames, self.config, self.backward_flow = frames, config, backward_flow
+        if backward_flow is not None and backward_flow.shape != (*frames.shape, 2):
+            raise ValueError(f"backward_flow must have shape {(*frames.shape, 2)}, not {backward_flow.shape}")
+        everywhere = np.ones(frames.shape, np.bool_)
+        self._visible = [everywhere if mask is None else _mask(mask, frames.shape) for mask in (visible_stereo1, visible_stereo2)]
+        self._everywhere = everywhere
+        self._prepared: dict[np.dtype, tuple[np.ndarray, ...]] = {}
+
+    def value_and_gradient(self, state: np.ndarray, visible: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """The per-pixel map and the gradient of its sum.
+
+        Parameters
+        ----------
+        state : np.ndarray
+            ``(5, H, W)``, float32 or float64, in pixels; decides the precision of everything.
+        visible : np.ndarray or None
+            ``(H, W)`` bool to use in place of the forward-backward check (to hold it fixed during a line search, say).
+
+        Returns
+        -------
+        loss : np.ndarray
+            ``(H, W)``; its sum is the energy (:func:`variational.jit.total` has the same bits for any number of threads).
+        gradient : np.ndarray
+            ``(5, H, W)``, derivative of the sum, per pixel of disparity or flow.
+        """
+        return self._run(state, visible, True)
+
+    def value(self, state: np.ndarray, visible: np.ndarray | None = None) -> float:
+        """The energy: the sum of the map, in float64. Cheaper than with the gradient."""
+        return total(self._run(state, visible, False)[0])
+
+    def _run(self, state: np.ndarray, visible: np.ndarray | None, with_gradient: bool) -> tuple[np.ndarray, np.ndarray]:
+        shape, config = self.frames.shape, self.config
+        check_state(state, shape)
+        find_visible = visible is None and self.backward_flow is not None and config.flow_weight + config.coupling_weight > 0
+        if visible is not None:
+            mask = _mask(visible, shape)
+        else:
+            mask = np.empty(shape, np.bool_) if find_visible else self._everywhere
+        loss, gradient = np.empty(shape, state.dtype), np.empty(state.shape, state.dtype)
+        pull, reach = np.empty(shape, state.dtype), np.empty((shape[0], 2), np.int64)
+        weights = (float(config.stereo_weight), float(config.flow_weight), float(config.coupling_weight),
+                   float(config.smoothness_weight))
+        _evaluate(state, *self._inputs(state.dtype), *self._visible, find_visible, mask, weights, float(config.ssim_share),
+                  float(config.charbonnier_intensity), float(config.charbonnier_px), float(config.visible_relative),
+                  float(config.visible_absolute), bool(config.drop_outside), band_edges(shape[0]), loss, gradient, pull,
+                  reach, with_gradient)
+        return loss, gradient
+
+    def _inputs(self, dtype: np.dtype) -> tuple[np.ndarray, ...]:
+        """What does not depend on the state, prepared once for each type."""
+        if dtype not in self._prepared:
+            frames, sharpness = self.frames, self.config.edge_sharpness
+            left1, right1, left2, right2 = (padded_planes(image, dtype)
+                                            for image in (frames.left1, frames.right1, frames.left2, frames.right2))
+            channels = left1.shape[0]
+            backward = np.zeros((2, 1), dtype) if self.backward_flow is None else flow_planes(self.backward_flow, dtype)
+            self._prepared[dtype] = (
+                left1, right1.reshape(channels, -1), left2, right2.reshape(channels, -1), left2.reshape(channels, -1),
+                edge_weights(frames.left1, sharpness, dtype), edge_weights(frames.left2, sharpness, dtype), backward,
+                window_overlap(frames.shape[0], dtype), window_overlap(frames.shape[1], dtype))
+        return self._prepared[dtype]
+
+
+def _mask(mask: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    if mask.dtype != np.bool_ or mask.shape != shape:
+        raise ValueError(f"a visible mask must be bool of shape {shape}, not {mask.dtype} {mask.shape}")
+    return np.ascontiguousarray(mask)

@@ -1,0 +1,234 @@
+"""Photometric term: structural similarity and absolute difference of an image and a warped one.
+
+``pe(a, b) = alpha clip((1 - SSIM(a, b)) / 2, 0, 1) + (1 - alpha) rho(a - b)``, mean over channels, where b(p) is the source
+sampled bilinearly at p + d(p). With the means over 3 x 3 pixels ``ma, mb, maa, mbb, mab`` of a, b, a^2, b^2 and a b::
+
+    SSIM = (2 ma mb + C1) (2 (mab - ma mb) + C2) / ((ma^2 + mb^2 + C1) (maa - ma^2 + mbb - mb^2 + C2))
+
+The means reflect at the border (pixel -1 is pixel 1; an axis of one pixel reflects to itself).
+
+Gradient. SSIM at p depends on the warped pixels through three means, so with ``P, Q, R`` its derivatives by mb, mbb and
+mab, the derivative of the sum by one warped pixel *gathers* from its neighbours, the adjoint of the 3 x 3 mean::
+
+    dE / db(q) = M^T[P](q) + 2 b(q) M^T[Q](q) + a(q) M^T[R](q) + (1 - alpha) rho'(b - a)
+
+and the chain rule with the sampler's derivative gives dE / dd. One pass streams over the rows: row y + 2 is warped, SSIM
+is taken at row y + 1, and row y receives its gradient, so that nothing larger than a few rows is ever stored.
+
+Reference: Godard et al. 2017 (doi:10.1109/CVPR.2017.699); Wang et al. 2004 (doi:10.1109/TIP.2003.819861).
+"""
+
+import numpy as np
+
+from variational.jit import real, rowwise, scalar
+from variational.penalties import penalty
+from variational.sampling import cell, interpolate
+
+C1, C2 = 0.01**2, 0.03**2
+
+
+def padded_planes(image: np.ndarray, dtype: np.dtype | type) -> np.ndarray:
+    """``(H, W, c)`` image as the kernels want it: ``(c, H + 2, W + 2)``, contiguous, reflected by one pixel."""
+    rows, columns = (np.abs(np.arange(-1, size + 1)) for size in image.shape[:2])
+    rows[-1], columns[-1] = max(image.shape[0] - 2, 0), max(image.shape[1] - 2, 0)
+    rows, columns = np.minimum(rows, image.shape[0] - 1), np.minimum(columns, image.shape[1] - 1)
+    return np.ascontiguousarray(image.transpose(2, 0, 1).astype(dtype)[:, rows[:, None], columns])
+
+
+@scalar
+def ssim(ma: float, mb: float, maa: float, mbb: float, mab: float, c1: float, c2: float) -> tuple[float, ...]:
+    """Structural similarity of the five means, and its derivatives P, Q, R by mb, mbb and mab."""
+    product, square_a, square_b = ma * mb, ma * ma, mb * mb
+    n1, n2 = product + product + c1, (mab - product) + (mab - product) + c2
+    d1, d2 = square_a + square_b + c1, (maa - square_a) + (mbb - square_b) + c2
+    inverse = real(1, ma) / (d1 * d2)
+    s = n1 * n2 * inverse
+    p = (ma * (n2 - n1) - s * mb * (d2 - d1)) * inverse
+    r = n1 * inverse
+    return s, p + p, -s * d1 * inverse, r + r
+
+
+def window_overlap(size: int, dtype: np.dtype | type) -> np.ndarray:
+    """``(3, size)``: how often the reflected 3-windows of pixels q - 1, q and q + 1 hold pixel q.
+
+    1 each inside; 0 where there is no such pixel, 2 where a window reflects onto q. The adjoint of the mean in one axis.
+    """
+    counts = np.zeros((3, size), dtype)
+    for p in range(size):
+        for q in (p - 1, p, p + 1):
+            q = reflect.py_func(q, size)
+            counts[p - q + 1, q] += 1
+    return counts
+
+
+@scalar
+def reflect(i: int, size: int) -> int:
+    """Index of the pixel that stands for pixel `i`, which is at most one outside an axis of `size` pixels."""
+    i = abs(i)
+    return max(i if i < size else size + size - 2 - i, 0)
+
+
+@rowwise
+def _locate(dx: np.ndarray, dy: np.ndarray | None, sign: float, y: int, shape: tuple[int, int], visible: np.ndarray,
+            drop_outside: bool, weight: float, index: np.ndarray, fx: np.ndarray, fy: np.ndarray, in_x: np.ndarray,
+            in_y: np.ndarray, keep: np.ndarray) -> None:
+    """Cells of one row of positions in the padded source, and `keep`, the weight of each pixel's error."""
+    zero, one = real(0, weight), real(1, weight)
+    height, width, row = real(shape[0], weight), real(shape[1], weight), real(y, weight)
+    stride = np.int32(shape[1] + 2)
+    start = np.int32((y + 1) * (shape[1] + 2) + 1)
+    for i in range(index.size):
+        x = np.int32(i)
+        shift, fx[i], inside = cell(sign * dx[i], real(x, weight), width)
+        index[i] = start + x + np.int32(shift)
+        in_x[i] = one if inside else zero
+        if dy is not None:
+            shift, fy[i], inside_y = cell(dy[i], row, height)
+            index[i] += np.int32(shift) * stride
+            in_y[i] = one if inside_y else zero
+            inside = inside and inside_y
+        keep[i] = weight if visible[i] and (inside or not drop_outside) else zero
+
+
+@rowwise
+def _warp(source: np.ndarray, vertical: np.ndarray | None, index: np.ndarray, fx: np.ndarray, fy: np.ndarray,
+          in_x: np.ndarray, in_y: np.ndarray, right: int, below: int, b: np.ndarray, slope_x: np.ndarray,
+          slope_y: np.ndarray) -> None:
+    """Sample one row of one channel: b, and its derivatives along x and y. `right`, `below`: steps to the neighbours."""
+    for i in range(index.size):
+        k = np.uint32(index[i])
+        v00, v01 = source[k], source[k + right]
+        if vertical is None:
+            b[i + 1] = v00 + fx[i] * (v01 - v00)
+            slope_x[i] = (v01 - v00) * in_x[i]
+        else:
+            v10, v11 = source[k + below], source[k + right + below]
+            b[i + 1], along_x, along_y = interpolate(v00, v01, v10, v11, fx[i], fy[i])
+            slope_x[i] = along_x * in_x[i]
+            slope_y[i] = along_y * in_y[i]
+
+
+@rowwise
+def _column_sums(a0: np.ndarray, a1: np.ndarray, a2: np.ndarray, b0: np.ndarray, b1: np.ndarray, b2: np.ndarray,
+                 sa: np.ndarray, sb: np.ndarray, saa: np.ndarray, sbb: np.ndarray, sab: np.ndarray) -> None:
+    """Sums over three rows of a, b, a^2, b^2 and a b."""
+    for i in range(sa.size):
+        sa[i] = a0[i] + a1[i] + a2[i]
+        sb[i] = b0[i] + b1[i] + b2[i]
+        saa[i] = a0[i] * a0[i] + a1[i] * a1[i] + a2[i] * a2[i]
+        sbb[i] = b0[i] * b0[i] + b1[i] * b1[i] + b2[i] * b2[i]
+        sab[i] = a0[i] * b0[i] + a1[i] * b1[i] + a2[i] * b2[i]
+
+
+@rowwise
+def _error(sa: np.ndarray, sb: np.ndarray, saa: np.ndarray, sbb: np.ndarray, sab: np.ndarray, a: np.ndarray, b: np.ndarray,
+           keep: np.ndarray, alpha: float, eps: float, loss: np.ndarray, p: np.ndarray, q: np.ndarray, r: np.ndarray) -> None:
+    """Add one row's error to `loss`; P, Q and R of every pixel, times its weight in the energy."""
+    ninth, one, half, zero = real(1 / 9, eps), real(1, eps), real(0.5, eps), real(0, eps)
+    c1, c2 = real(C1, eps), real(C2, eps)
+    for i in range(keep.size):
+        s, dp, dq, dr = ssim((sa[i] + sa[i + 1] + sa[i + 2]) * ninth, (sb[i] + sb[i + 1] + sb[i + 2]) * ninth,
+                             (saa[i] + saa[i + 1] + saa[i + 2]) * ninth, (sbb[i] + sbb[i + 1] + sbb[i + 2]) * ninth,
+                             (sab[i] + sab[i + 1] + sab[i + 2]) * ninth, c1, c2)
+        difference, _ = penalty(b[i + 1] - a[i + 1], eps)
+        dissimilarity = (one - s) * half
+        clipped = zero if dissimilarity < zero else (one if dissimilarity > one else dissimilarity)
+        loss[i] += keep[i] * (alpha * clipped + (one - alpha) * difference)
+        scale = zero if clipped != dissimilarity else -alpha * half * ninth * keep[i]
+        p[i + 1] = scale * dp
+        q[i + 1] = scale * dq
+        r[i + 1] = scale * dr
+
+
+@rowwise
+def _adjoint_column_sums(p: np.ndarray, q: np.ndarray, r: np.ndarray, y: int, above: float, here: float, below: float,
+                         sp: np.ndarray, sq: np.ndarray, sr: np.ndarray) -> None:
+    """Rows y - 1, y, y + 1 of P, Q and R added with the weights of :func:`window_overlap`."""
+    i0, i1, i2 = (y + 2) % 3, y % 3, (y + 1) % 3
+    for i in range(sp.size):
+        sp[i] = above * p[i0, i] + here * p[i1, i] + below * p[i2, i]
+        sq[i] = above * q[i0, i] + here * q[i1, i] + below * q[i2, i]
+        sr[i] = above * r[i0, i] + here * r[i1, i] + below * r[i2, i]
+
+
+@rowwise
+def _gradient(sp: np.ndarray, sq: np.ndarray, sr: np.ndarray, overlap: np.ndarray, a: np.ndarray, b: np.ndarray,
+              slope_x: np.ndarray, slope_y: np.ndarray, vertical: np.ndarray | None, keep: np.ndarray, sign: float,
+              beta: float, eps: float, grad_x: np.ndarray, grad_y: np.ndarray) -> None:
+    """Add one row and channel of dE / dd."""
+    for i in range(keep.size):
+        left, centre, right = overlap[0, i], overlap[1, i], overlap[2, i]
+        _, slope = penalty(b[i + 1] - a[i + 1], eps)
+        db = beta * keep[i] * slope + left * sp[i] + centre * sp[i + 1] + right * sp[i + 2]
+        db += (b[i + 1] + b[i + 1]) * (left * sq[i] + centre * sq[i + 1] + right * sq[i + 2])
+        db += a[i + 1] * (left * sr[i] + centre * sr[i + 1] + right * sr[i + 2])
+        grad_x[i] += sign * db * slope_x[i]
+        if vertical is not None:
+            grad_y[i] += db * slope_y[i]
+
+
+@rowwise
+def photometric_band(target: np.ndarray, source: np.ndarray, dx: np.ndarray, dy: np.ndarray | None, sign: float,
+                     visible: np.ndarray, overlap_y: np.ndarray, overlap_x: np.ndarray, weight: float, alpha: float,
+                     eps: float, drop_outside: bool, first: int, last: int, loss: np.ndarray, grad_x: np.ndarray,
+                     grad_y: np.ndarray, with_gradient: bool) -> None:
+    """Add the term of rows `first` to `last` (excluded) to the map and the gradient.
+
+    Parameters
+    ----------
+    target : np.ndarray
+        a, as :func:`padded_planes` gives it.
+    source : np.ndarray
+        The image to sample, likewise, with the last two axes flattened.
+    dx, dy : np.ndarray, np.ndarray or None
+        ``(H, W)`` displacements in pixels; None for a stereo pair, where nothing moves vertically.
+    sign : float
+        1 or -1 times dx is the displacement: disparities point to the left.
+    visible : np.ndarray
+        ``(H, W)`` bool; the term is zero elsewhere.
+    overlap_y, overlap_x : np.ndarray
+        :func:`window_overlap` of the two axes.
+    weight, alpha, eps, drop_outside :
+        As in :class:`variational.energy.EnergyConfig`.
+    loss, grad_x, grad_y : np.ndarray
+        ``(H, W)``, added to; grad_y is left alone where dy is None.
+    """
+    channels, height, width = target.shape[0], target.shape[1] - 2, target.shape[2] - 2
+    kind = target.dtype.type
+    weight, sign, alpha, eps = kind(weight / channels), kind(sign), kind(alpha), kind(eps)
+    right, below = np.uint32(min(width - 1, 1)), np.uint32((width + 2) * min(height - 1, 1))
+    index, cells = np.empty(width, np.int32), np.empty((4, width), target.dtype)
+    fx, fy, in_x, in_y = cells[0], cells[1], cells[2], cells[3]
+    # Rings of three rows, row y in slot y % 3. P, Q and R are zero in their padding.
+    keep, slopes = np.empty((3, width), target.dtype), np.empty((2, channels, 3, width), target.dtype)
+    warped = np.empty((channels, 3, width + 2), target.dtype)
+    pqr = np.zeros((3, channels, 3, width + 2), target.dtype)
+    sums, spare = np.empty((5, width + 2), target.dtype), np.empty(width, target.dtype)
+    for step in range(first - 2, last + 2):
+        y = step
+        if 0 <= y < height:
+            slot = y % 3
+            _locate(dx[y], None if dy is None else dy[y], sign, y, (height, width), visible[y], drop_outside, weight,
+                    index, fx, fy, in_x, in_y, keep[slot])
+            for c in range(channels):
+                b = warped[c, slot]
+                _warp(source[c], dy, index, fx, fy, in_x, in_y, right, below, b, slopes[0, c, slot], slopes[1, c, slot])
+                b[0], b[width + 1] = b[min(2, width)], b[max(width - 1, 1)]
+        y = step - 1
+        if max(first - 1, 0) <= y < min(last + 1, height):
+            slot, above, under = y % 3, reflect(y - 1, height) % 3, reflect(y + 1, height) % 3
+            row_loss = loss[y] if first <= y < last else spare
+            for c in range(channels):
+                b = warped[c]
+                _column_sums(target[c, y], target[c, y + 1], target[c, y + 2], b[above], b[slot], b[under],
+                             sums[0], sums[1], sums[2], sums[3], sums[4])
+                _error(sums[0], sums[1], sums[2], sums[3], sums[4], target[c, y + 1], b[slot], keep[slot], alpha, eps,
+                       row_loss, pqr[0, c, slot], pqr[1, c, slot], pqr[2, c, slot])
+        y = step - 2
+        if with_gradient and first <= y < last:
+            slot = y % 3
+            for c in range(channels):
+                _adjoint_column_sums(pqr[0, c], pqr[1, c], pqr[2, c], y, overlap_y[0, y], overlap_y[1, y], overlap_y[2, y],
+                                     sums[0], sums[1], sums[2])
+                _gradient(sums[0], sums[1], sums[2], overlap_x, target[c, y + 1], warped[c, slot], slopes[0, c, slot],
+                          slopes[1, c, slot], dy, keep[slot], sign, kind(1) - alpha, eps, grad_x[y], grad_y[y])
