@@ -23,28 +23,36 @@ EDGE_SLACK = 1e-9
 
 @rowwise
 def setup_triangles(
-    corners: np.ndarray, culled: np.ndarray, intrinsics: np.ndarray, height: int, width: int,
-    plane: np.ndarray, bounds: np.ndarray,
+    points: np.ndarray, pose: np.ndarray, culled: np.ndarray, intrinsics: np.ndarray, height: int, width: int,
+    corners: np.ndarray, plane: np.ndarray, bounds: np.ndarray,
 ) -> None:  # fmt: skip
     """Ray equations and pixel bounds of triangles.
 
     Parameters
     ----------
-    corners : ndarray (N, 3, 3) float64
-        Camera coordinates in metres.
+    points : ndarray (N, 3, 3) float64
+        Corners in world coordinates, metres.
+    pose : ndarray (4, 4) float64
+        World to camera.
     culled : ndarray (N,) bool
         Skip the triangle when it is seen from behind.
     intrinsics : ndarray (4,) float64
         fx, fy, cx, cy in pixels.
+    corners : ndarray (N, 3, 3) float64, written
+        Camera coordinates in metres.
     plane : ndarray (N, 3, 3) float64, written
         ``b_i = plane[n, i, 0] x + plane[n, i, 1] y + plane[n, i, 2]``.
     bounds : ndarray (N, 4) int32, written
         First and last column, first and last row; an empty range for a triangle that no ray meets.
     """
     fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
-    for n in range(corners.shape[0]):
+    for n in range(points.shape[0]):
         bounds[n, 0], bounds[n, 1], bounds[n, 2], bounds[n, 3] = 0, -1, 0, -1
         v = corners[n]
+        for c in range(3):
+            for i in range(3):
+                x, y, z = points[n, c, 0], points[n, c, 1], points[n, c, 2]
+                v[c, i] = pose[i, 0] * x + pose[i, 1] * y + pose[i, 2] * z + pose[i, 3]
         if v[0, 2] < NEAR_M and v[1, 2] < NEAR_M and v[2, 2] < NEAR_M:
             continue
         low_x, high_x, low_y, high_y = 1e9, -1e9, 1e9, -1e9
@@ -164,8 +172,10 @@ class Caster:
 
     Parameters
     ----------
-    corners : ndarray (N, 3, 3) float64
-        Triangles in this camera's coordinates, metres.
+    points : ndarray (N, 3, 3) float64
+        Triangles in world coordinates, metres.
+    pose : ndarray (4, 4) float64
+        World to camera.
     culled : ndarray (N,) bool
         Triangles that are seen from one side only.
     intrinsics : ndarray (4,) float64
@@ -174,42 +184,61 @@ class Caster:
         Image size in pixels.
     """
 
-    def __init__(self, corners: np.ndarray, culled: np.ndarray, intrinsics: np.ndarray, height: int, width: int) -> None:
-        self.corners, self.intrinsics, self.height, self.width = corners, intrinsics, height, width
-        self.plane = np.empty((len(corners), 3, 3))
-        self.bounds = np.empty((len(corners), 4), np.int32)
-        setup_triangles(corners, culled, intrinsics, height, width, self.plane, self.bounds)
+    def __init__(
+        self, points: np.ndarray, pose: np.ndarray, culled: np.ndarray, intrinsics: np.ndarray, height: int, width: int
+    ) -> None:
+        self.pose, self.intrinsics, self.height, self.width = pose, intrinsics, height, width
+        self.corners, self.plane = np.empty_like(points), np.empty_like(points)
+        self.bounds = np.empty((len(points), 4), np.int32)
+        setup_triangles(points, pose, culled, intrinsics, height, width, self.corners, self.plane, self.bounds)
 
-    def pattern(self, offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Hits of the same rays in every pixel.
+    def _cast(self, x: np.ndarray, y: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        inverse_depth, hit = np.empty(x.size), np.empty(x.size, np.int32)
+        cast(self.plane, self.bounds, x, y, start, self.width, inverse_depth, hit)
+        return inverse_depth, hit
+
+    def centres(self) -> tuple[np.ndarray, np.ndarray]:
+        """What the pixels' centres see.
+
+        Returns
+        -------
+        inverse_depth : ndarray (H, W) float64
+            1 / Z in 1/m; 0 where nothing is met.
+        hit : ndarray (H, W) int32
+            Triangle, or -1.
+        """
+        shape = (self.height, self.width)
+        y, x = np.divmod(np.arange(self.height * self.width), self.width)
+        inverse_depth, hit = self._cast(x.astype(float), y.astype(float), np.arange(x.size + 1))
+        return inverse_depth.reshape(shape), hit.reshape(shape)
+
+    def within(self, pixels: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Several rays in each of some pixels.
 
         Parameters
         ----------
+        pixels : ndarray (P,) int
+            Numbers ``y * width + x`` of pixels, ascending.
         offsets : ndarray (K, 2) float64
             Positions (x, y) relative to the pixel's centre, within (-0.5, 0.5).
 
         Returns
         -------
-        inverse_depth : ndarray (H, W, K) float64
-            1 / Z in 1/m; 0 where nothing is met.
-        hit : ndarray (H, W, K) int32
+        x, y : ndarray (P * K,) float64
+            The rays in pixels.
+        hit : ndarray (P * K,) int32
             Triangle, or -1.
         """
-        count = len(offsets)
-        shape = (self.height, self.width, count)
-        x = np.arange(self.width, dtype=float)[None, :, None] + offsets[:, 0]
-        y = np.arange(self.height, dtype=float)[:, None, None] + offsets[:, 1]
-        x, y = np.broadcast_to(x, shape).ravel(), np.broadcast_to(y, shape).ravel()
-        start = np.arange(0, self.height * self.width * count + 1, count)
-        inverse_depth, hit = np.empty(x.size), np.empty(x.size, np.int32)
-        cast(self.plane, self.bounds, x, y, start, self.width, inverse_depth, hit)
-        return inverse_depth.reshape(shape), hit.reshape(shape)
+        row, column = np.divmod(pixels, self.width)
+        x, y = (column[:, None] + offsets[:, 0]).ravel(), (row[:, None] + offsets[:, 1]).ravel()
+        count = np.zeros(self.height * self.width + 1, np.int64)
+        count[pixels + 1] = len(offsets)
+        _, hit = self._cast(x, y, np.cumsum(count))
+        return x, y, hit
 
-    def nearest(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Inverse depth (R,) and triangle (R,) along rays anywhere; NaN and -1 outside the image."""
+    def nearest(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Inverse depth (R,) of what rays anywhere meet first; NaN outside the image."""
         order, start = sort_rays(x, y, self.height, self.width)
-        near, found = np.empty(len(order)), np.empty(len(order), np.int32)
-        cast(self.plane, self.bounds, x[order], y[order], start, self.width, near, found)
-        inverse_depth, hit = np.full(x.size, np.nan), np.full(x.size, -1, np.int32)
-        inverse_depth[order], hit[order] = near, found
-        return inverse_depth, hit
+        inverse_depth = np.full(x.size, np.nan)
+        inverse_depth[order], _ = self._cast(x[order], y[order], start)
+        return inverse_depth

@@ -61,3 +61,77 @@ def paint(rng: np.random.Generator, bgr: np.ndarray | None = None, gloss: float 
     bgr = color(rng) if bgr is None else np.asarray(bgr, float)
     texture = procedural("clouds", int(rng.integers(24)))
     return Material(texture, tinted(bgr, rng.uniform(0.02, 0.2)), rng.uniform(0.3, 1.0), specular=gloss, shininess=60.0, mirror=mirror, glow=glow)
+
+
+def foliage(source: TextureSource) -> Material:
+    """Leaves in the colours of the seasons."""
+    rng = source.rng
+    tint = np.array([rng.uniform(0.4, 0.9), 1.0, rng.uniform(0.5, 1.1)]) * rng.uniform(0.5, 1.2)
+    if rng.random() < 0.15:
+        tint = np.array([0.5, rng.uniform(0.6, 0.9), 1.3])
+    return Material(source.kind("foliage"), np.eye(3, 4) * tint[:, None], rng.uniform(0.7, 1.6), 0.0, tuple(rng.random(2)))
+
+
+class Wardrobe:
+    """The materials of a street's props: what all copies share is made once a scene, coats and lacquers for each copy."""
+
+    def __init__(self, source: TextureSource) -> None:
+        rng = self.rng = source.rng
+        self.source = source
+        bark = tinted(np.array([0.2, 0.28, 0.36]) * rng.uniform(0.5, 1.4), 0.6)
+        self.shared = {
+            "dark": paint(rng, np.full(3, rng.uniform(0.02, 0.1))),
+            "glass": paint(rng, np.full(3, rng.uniform(0.03, 0.16)), 0.8, rng.uniform(0.4, 1.0)),
+            "rim": paint(rng, np.full(3, rng.uniform(0.3, 0.8)), 0.5, 0.3),
+            "white": paint(rng, np.array([0.9, 0.95, 1.0]), 0.5, 0.2, rng.uniform(0, 0.6)),
+            "red": paint(rng, np.array([0.05, 0.05, 0.75]), 0.5, 0.2, rng.uniform(0, 0.6)),
+            "plate": Material(source.kind("text"), tinted(np.full(3, 0.85), 0.9), 2.0, 0.0, tuple(rng.random(2))),
+            "bark": Material(source.kind("wood", "marble", "grain"), bark, 1.5, np.pi / 2),
+            "metal": paint(rng, np.full(3, rng.uniform(0.05, 0.65)), 0.3),
+            "lamp": paint(rng, np.full(3, 0.8), glow=float(rng.choice([0, 1.0]))),
+            "wood": Material(source.kind("wood"), np.eye(3, 4), 0.8),
+            "stone": upright(source, rng.uniform(1, 2.5), "masonry", "grain", "cells", "rust"),
+            "leaf": foliage(source),
+        }  # fmt: skip
+
+    def lacquer(self) -> Material:
+        """Car paint: white to grey, black, loud, or any colour."""
+        rng = self.rng
+        bgr = (
+            np.full(3, rng.uniform(0.4, 0.95)), np.full(3, rng.uniform(0.03, 0.15)), color(rng, 0.9, rng.uniform(0.25, 0.8)),
+            color(rng, rng.uniform(0.1, 0.6)),
+        )[int(rng.choice(4, p=[0.35, 0.2, 0.2, 0.25]))]  # fmt: skip
+        return paint(rng, bgr, rng.uniform(0.3, 1.2), rng.uniform(0.2, 0.7))
+
+    def vehicle(self) -> dict[str, Material]:
+        """Materials of a car, a truck or a bicycle with its rider."""
+        rng, source = self.rng, self.source
+        load = paint(rng, None, 0.3, 0.2)
+        if rng.random() < 0.5:
+            picture = source.any("text", "stripes", "facade", "leaves")
+            load = Material(picture, np.eye(3, 4), rng.uniform(0.15, 0.5), 0.0, tuple(rng.random(2)), specular=0.2)
+        return self.shared | {"body": self.lacquer(), "load": load} | self.clothes()
+
+    def clothes(self) -> dict[str, Material]:
+        """Materials of a person."""
+        rng = self.rng
+        coat = self.source.any("stripes", "plain", "clouds", "checks", "leaves")
+        return {
+            "coat": Material(coat, np.eye(3, 4) * rng.uniform(0.4, 1.0), 1.5, 0.0, tuple(rng.random(2))),
+            "trousers": paint(rng, color(rng, 0.3, rng.uniform(0.05, 0.4))),
+            "skin": paint(rng, np.array([0.45, 0.55, 0.75]) * rng.uniform(0.35, 1.1)),
+            "hair": paint(rng, color(rng, 0.5, rng.uniform(0.03, 0.4))),
+        }
+
+    def roadside(self) -> dict[str, Material]:
+        """Materials of poles, signs, bins, plants and fences."""
+        rng, source = self.rng, self.source
+        body = paint(rng, None, 0.2)
+        if rng.random() < 0.4:
+            body = Material(source.kind("stripes", "rust", "text", "dots"), np.eye(3, 4), 1.2)
+        return self.shared | {
+            "body": body,
+            "frame": paint(rng, color(rng, 0.95, 0.75)),
+            "face": Material(source.any("text"), tinted(color(rng, float(rng.choice([0.0, 0.9])), 0.9), 0.3), 1.4),
+            "leaf": self.shared["leaf"] if rng.random() < 0.7 else foliage(source),
+        }

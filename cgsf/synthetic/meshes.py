@@ -111,7 +111,11 @@ def polygon(corners: np.ndarray, uv: np.ndarray | None = None) -> Mesh:
 
 def grid(points: np.ndarray, uv: np.ndarray, smooth: bool = True) -> Mesh:
     """A surface over a grid of `points` (A, B, 3) m with texture coordinates `uv` (A, B, 2) m: two triangles a cell."""
-    along, across = np.gradient(points, axis=0), np.gradient(points, axis=1)
+    along, across = np.empty_like(points), np.empty_like(points)
+    along[1:-1], along[0], along[-1] = points[2:] - points[:-2], points[1] - points[0], points[-1] - points[-2]
+    across[:, 1:-1], across[:, 0], across[:, -1] = (
+        points[:, 2:] - points[:, :-2], points[:, 1] - points[:, 0], points[:, -1] - points[:, -2],
+    )  # fmt: skip
     for axis, difference in ((0, along), (1, across)):  # rows or columns that meet again share their normals
         first, last = np.take(points, 0, axis), np.take(points, -1, axis)
         if np.abs(first - last).max() < 1e-9 * (1 + np.abs(first).max()):
@@ -154,15 +158,23 @@ _CUBE = np.array(  # faces, corners in order round each
 _HALVES = np.array([[0, 2, 1], [0, 3, 2]])
 
 
+def boxes(sizes: np.ndarray, middles: np.ndarray | Sequence[Sequence[float]] = ((0, 0, 0),)) -> Mesh:
+    """Boxes of `sizes` (K, 3) or (3,) m about `middles` (K, 3) m; the texture stands upright on their four sides."""
+    sizes, middles = np.broadcast_arrays(np.atleast_2d(np.asarray(sizes, float)), np.asarray(middles, float))
+    faces = _CUBE * (sizes / 2)[:, None, None]
+    width = np.linalg.norm(faces[:, :, 1] - faces[:, :, 0], axis=-1)
+    height = np.linalg.norm(faces[:, :, 2] - faces[:, :, 1], axis=-1)
+    zero = np.zeros_like(width)
+    uv = np.stack([np.stack([zero, width, width, zero], -1), np.stack([zero, zero, height, height], -1)], -1)
+    points = (faces + middles[:, None, None])[:, :, _HALVES].reshape(-1, 3, 3)
+    count = len(sizes)
+    normals = np.tile(np.repeat(_CUBE.mean(1), 6, axis=0).reshape(12, 3, 3), (count, 1, 1))
+    return Mesh(points, normals, uv[:, :, _HALVES].reshape(-1, 3, 2), np.repeat(np.arange(6 * count), 2), True)
+
+
 def box(size: Sequence[float]) -> Mesh:
-    """A box of `size` (x, y, z) m about the origin; the texture stands upright on its four sides."""
-    faces = _CUBE * (np.asarray(size, float) / 2)
-    width = np.linalg.norm(faces[:, 1] - faces[:, 0], axis=-1)
-    height = np.linalg.norm(faces[:, 2] - faces[:, 1], axis=-1)
-    zero = np.zeros(6)
-    uv = np.stack([np.stack([zero, width, width, zero], 1), np.stack([zero, zero, height, height], 1)], -1)
-    points = faces[:, _HALVES].reshape(12, 3, 3)
-    return Mesh(points, _flat_normals(points), uv[:, _HALVES].reshape(12, 3, 2), np.repeat(np.arange(6), 2), True)
+    """A box of `size` (x, y, z) m about the origin."""
+    return boxes(np.asarray(size, float))
 
 
 def hull(points: np.ndarray) -> Mesh:

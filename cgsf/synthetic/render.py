@@ -17,8 +17,7 @@ from cgsf.synthetic.shading import Illumination, Surfaces, shade_image
 from cgsf.synthetic.textures import TextureSource
 from cgsf.synthetic.truth import View, follow, seen
 
-_CENTRE = np.zeros((1, 2))
-_QUARTERS = np.array([[0.0, 0.0], [-0.125, -0.375], [0.375, -0.125], [0.125, 0.375], [-0.375, 0.125]])
+_QUARTERS = np.array([[-0.125, -0.375], [0.375, -0.125], [0.125, 0.375], [-0.375, 0.125]])
 
 
 @dataclass(frozen=True)
@@ -79,12 +78,13 @@ class Renderer:
         camera = scene.camera
         self.intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy], float)
         self.soup = Soup.of(scene)
+        self.no_culling = np.zeros(len(self.soup.points), bool)
         textures = self.soup.textures
         self.atlas = np.concatenate([texture.levels for texture in textures])
         self.atlas_start = np.cumsum([0, *(len(texture.levels) for texture in textures[:-1])])
         self.atlas_size = np.array([texture.size for texture in textures])
         self.atlas_mirrored = np.array([texture.mirrored for texture in textures])
-        self.offsets = _QUARTERS if config.antialias else _CENTRE
+        self.offsets = _QUARTERS if config.antialias else _QUARTERS[:0]
 
     def stereo(self, time: float) -> tuple[View, View, np.ndarray, np.ndarray]:
         """Left and right view at `time` with their radiance, (H, W, 3) float32 each."""
@@ -95,16 +95,14 @@ class Renderer:
         for shift in (0.0, self.scene.camera.baseline_m):
             pose = pose.copy()
             pose[0, 3] -= shift
-            corners = points @ pose[:3, :3].T + pose[:3, 3]
-            caster = Caster(corners, self.soup.culled, self.intrinsics, self.height, self.width)
-            inverse_depth, hit = caster.pattern(self.offsets)
+            caster = Caster(points, pose, self.soup.culled, self.intrinsics, self.height, self.width)
+            inverse_depth, hit = caster.centres()
             surfaces = Surfaces(
                 caster.plane, points, normals, self.soup.uv, self.soup.surface, self.soup.material, self.soup.materials,
                 self.atlas, self.atlas_start, self.atlas_size, self.atlas_mirrored,
             )  # fmt: skip
-            radiance = shade_image(surfaces, light, pose, self.intrinsics, self.offsets, hit, inverse_depth)
-            views.append(View(caster, pose, inverse_depth[..., 0].copy(), hit[..., 0].copy()))
-            radiances.append(radiance)
+            radiances.append(shade_image(surfaces, light, caster, inverse_depth, hit, self.offsets))
+            views.append(View(caster, inverse_depth, hit))
         return views[0], views[1], radiances[0], radiances[1]
 
     def exposed(self, time: float) -> tuple[View, View, np.ndarray, np.ndarray]:
@@ -137,11 +135,10 @@ class Renderer:
         focal = 0.5 * size * distance / light.radius
         middle = 0.5 * (size - 1)
         if self.config.shadows:
-            corners = points @ pose[:3, :3].T + pose[:3, 3]
-            caster = Caster(corners, np.zeros(len(points), bool), np.array([focal, focal, middle, middle]), size, size)
-            inverse_depth, _ = caster.pattern(_CENTRE)
+            caster = Caster(points, pose, self.no_culling, np.array([focal, focal, middle, middle]), size, size)
+            inverse_depth, _ = caster.centres()
             with np.errstate(divide="ignore"):
-                depth = (1 / inverse_depth[..., 0]).astype(np.float32)
+                depth = (1 / inverse_depth).astype(np.float32)
         else:
             depth = np.full((size, size), np.inf, np.float32)
         bias = 2.0 * light.radius / size + 0.01

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from cgsf.synthetic.meshes import Mesh
 from cgsf.synthetic.textures import Texture
 from variational.camera import StereoCamera
+from variational.jit import rowwise
 
 MATERIAL = np.dtype(
     [
@@ -83,7 +84,8 @@ class Motion:
     def pose(self, time: float) -> np.ndarray:
         """(4, 4) matrix from world points at time 0 to the same points at `time`."""
         matrix = np.eye(4)
-        matrix[:3, :3] = Rotation.from_rotvec(np.asarray(self.spin, float) * time).as_matrix()
+        if np.any(self.spin):
+            matrix[:3, :3] = Rotation.from_rotvec(np.asarray(self.spin, float) * time).as_matrix()
         matrix[:3, 3] = self.pivot + np.asarray(self.velocity, float) * time - matrix[:3, :3] @ self.pivot
         return matrix
 
@@ -168,12 +170,19 @@ class Sky:
     haze_per_m: float = 0.0
 
 
-@dataclass
+_HERE = np.eye(4)
+
+
+@dataclass(frozen=True)
 class Part:
-    """One mesh in the world at time 0 with its material; `object_id` 0 stands still, parts of one object share an id."""
+    """One mesh with its material, its place in the world at time 0 (4, 4) and its motion.
+
+    `object_id` 0 stands still; the parts of one object share an id.
+    """
 
     mesh: Mesh
     material: Material
+    place: np.ndarray
     motion: Motion | None = None
     object_id: int = 0
 
@@ -198,9 +207,11 @@ class Scene:
     sky: Sky
     parts: list[Part] = field(default_factory=list)
 
-    def add(self, mesh: Mesh, material: Material, motion: Motion | None = None, object_id: int = 0) -> None:
-        """Put a mesh, given in world coordinates at time 0, into the scene."""
-        self.parts.append(Part(mesh, material, motion, object_id))
+    def add(
+        self, mesh: Mesh, material: Material, motion: Motion | None = None, object_id: int = 0, place: np.ndarray = _HERE
+    ) -> None:
+        """Put a mesh into the scene; `place` (4, 4) takes its coordinates to the world's at time 0."""
+        self.parts.append(Part(mesh, material, place, motion, object_id))
 
 
 @dataclass(frozen=True)
@@ -210,7 +221,7 @@ class Soup:
     Parameters
     ----------
     points, normals : ndarray (N, 3, 3) float64
-        World coordinates at time 0.
+        In each part's own coordinates.
     uv : ndarray (N, 3, 2) float64
     surface : ndarray (N,) int64
         Smooth surface that the triangle belongs to, unique over the scene.
@@ -272,11 +283,30 @@ class Soup:
 
     def at(self, scene: Scene, time: float) -> tuple[np.ndarray, np.ndarray]:
         """World coordinates of the corners and their normals at `time`, (N, 3, 3) each."""
-        poses = np.stack([np.eye(4) if part.motion is None else part.motion.pose(time) for part in scene.parts])
-        points, normals = self.points.copy(), self.normals.copy()
-        moving = np.array([part.motion is not None for part in scene.parts])[self.part]
-        if moving.any():
-            turn, shift = poses[self.part[moving], :3, :3], poses[self.part[moving], None, :3, 3]
-            points[moving] = np.einsum("nij,ncj->nci", turn, points[moving]) + shift
-            normals[moving] = np.einsum("nij,ncj->nci", turn, normals[moving])
+        places = np.stack([part.place for part in scene.parts])
+        moving = [index for index, part in enumerate(scene.parts) if part.motion is not None]
+        poses: dict[int, np.ndarray] = {}
+        for index in moving:
+            motion = scene.parts[index].motion
+            assert motion is not None
+            if id(motion) not in poses:
+                poses[id(motion)] = motion.pose(time)
+            places[index] = poses[id(motion)] @ places[index]
+        points, normals = np.empty_like(self.points), np.empty_like(self.normals)
+        _place(self.points, self.normals, self.part, places, points, normals)
         return points, normals
+
+
+@rowwise
+def _place(
+    points: np.ndarray, normals: np.ndarray, part: np.ndarray, places: np.ndarray, points_out: np.ndarray, normals_out: np.ndarray
+) -> None:
+    """Rigidly move every triangle by its part's matrix."""
+    for n in range(points.shape[0]):
+        m = places[part[n]]
+        for c in range(3):
+            for i in range(3):
+                points_out[n, c, i] = (
+                    m[i, 0] * points[n, c, 0] + m[i, 1] * points[n, c, 1] + m[i, 2] * points[n, c, 2] + m[i, 3]
+                )
+                normals_out[n, c, i] = m[i, 0] * normals[n, c, 0] + m[i, 1] * normals[n, c, 1] + m[i, 2] * normals[n, c, 2]

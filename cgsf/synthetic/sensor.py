@@ -1,9 +1,12 @@
 """From radiance to the picture that a camera delivers: exposure, vignetting, blur, tone curve, noise, eight bits."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
+
+from variational.jit import rowwise
 
 
 @dataclass(frozen=True)
@@ -67,26 +70,51 @@ class Sensor:
 
     def develop(self, radiance: np.ndarray, scale: float, camera: int, frame: int, rng: np.random.Generator) -> np.ndarray:
         """The picture (H, W, 3) float32 in [0, 1] of `radiance` by camera 0 (left) or 1 (right)."""
-        height, width = radiance.shape[:2]
         gain = np.ones(3) if self.gain is None else self.gain[camera]
         factor = scale * gain * (1.0 if self.flicker is None else self.flicker[frame])
-        image = radiance * factor.astype(np.float32)
-        if self.vignetting > 0:
-            y = np.linspace(-1, 1, height, dtype=np.float32)[:, None, None] ** 2
-            x = np.linspace(-1, 1, width, dtype=np.float32)[None, :, None] ** 2
-            image *= 1 - np.float32(self.vignetting) * (0.5 * (x + y))
-        if self.grey:
-            image = np.repeat(image @ np.array([[0.114], [0.587], [0.299]], np.float32), 3, axis=-1)
-        np.clip(image, 0, 1, out=image)
-        image = cv2.pow(image, self.gamma)
+        image = np.empty_like(radiance)
+        _expose(radiance, factor, self.vignetting, self.gamma, self.grey, image)
         if self.blur_px > 0.2:
             image = cv2.GaussianBlur(image, (5, 5), self.blur_px)
         if self.read_noise > 0 or self.shot_noise > 0:
-            noise = rng.standard_normal(image.shape[:2] if self.grey else image.shape, dtype=np.float32)
-            if self.grey:
-                noise = noise[..., None]
-            image += noise * (np.float32(self.read_noise) + np.float32(self.shot_noise) * image)
-        np.clip(image, 0, 1, out=image)
+            _add_noise(image, _normals(), int(rng.integers(1 << 62)), self.read_noise, self.shot_noise, self.grey)
         if self.eight_bits:
-            image = np.round(image * np.float32(255)) / np.float32(255)
+            image *= 255
+            np.rint(image, out=image)
+            image /= 255
         return image
+
+
+@rowwise
+def _expose(radiance: np.ndarray, factor: np.ndarray, vignetting: float, gamma: float, grey: bool, out: np.ndarray) -> None:
+    height, width = radiance.shape[0], radiance.shape[1]
+    for row in range(height):
+        y = 2.0 * row / (height - 1) - 1.0
+        for column in range(width):
+            x = 2.0 * column / (width - 1) - 1.0
+            light = 1.0 - vignetting * 0.5 * (x * x + y * y)
+            b, g, r = radiance[row, column, 0] * factor[0], radiance[row, column, 1] * factor[1], radiance[row, column, 2] * factor[2]
+            if grey:
+                b = g = r = 0.114 * b + 0.587 * g + 0.299 * r
+            out[row, column, 0] = min(max(b * light, 0.0), 1.0) ** gamma
+            out[row, column, 1] = min(max(g * light, 0.0), 1.0) ** gamma if not grey else out[row, column, 0]
+            out[row, column, 2] = min(max(r * light, 0.0), 1.0) ** gamma if not grey else out[row, column, 0]
+
+
+@lru_cache(maxsize=1)
+def _normals() -> np.ndarray:
+    return np.random.default_rng(7).standard_normal(1 << 15).astype(np.float32)
+
+
+@rowwise
+def _add_noise(image: np.ndarray, normals: np.ndarray, seed: int, read: float, shot: float, grey: bool) -> None:
+    """Gaussian noise drawn from a table by a linear congruential generator, and the clip to [0, 1]."""
+    state = np.uint64(seed)
+    for row in range(image.shape[0]):
+        for column in range(image.shape[1]):
+            for channel in range(3):
+                if channel == 0 or not grey:
+                    state = state * np.uint64(6364136223846793005) + np.uint64(1442695040888963407)
+                value = image[row, column, channel]
+                value += normals[state >> np.uint64(49)] * (read + shot * value)
+                image[row, column, channel] = min(max(value, 0.0), 1.0)

@@ -1,14 +1,20 @@
 """From hits to colours: textures, light, shadows, highlights, mirrors, haze.
 
-Colours are linear radiance, BGR. A pixel whose rays all meet one smooth surface is shaded once, at its centre, with a
-texture filtered to the pixel's footprint; any other pixel is shaded once for each surface that its rays meet.
+Colours are linear radiance, BGR. A pixel inside a smooth surface is shaded once, at its centre, with the texture filtered
+to the pixel's footprint. A pixel at an edge casts more rays and is shaded once for each surface that they meet.
 """
 
 import math
 from typing import NamedTuple
 
 import numpy as np
+
+from cgsf.synthetic.caster import Caster
 from variational.jit import rowwise, scalar
+
+
+#: Share of the pixel over which textures are averaged: a little less than all keeps pictures crisp.
+_SHARPNESS = 0.85
 
 
 class Surfaces(NamedTuple):
@@ -46,7 +52,7 @@ class Illumination(NamedTuple):
     gloss: float
 
 
-@rowwise
+@scalar
 def _level(atlas: np.ndarray, start: int, size: int, mirrored: bool, u: float, v: float, weight: float, out: np.ndarray) -> None:
     """Add `weight` times the bilinear value of one texture copy at (u, v) in repeats, pixel centres at halves."""
     x, y = u * size - 0.5, v * size - 0.5
@@ -71,28 +77,29 @@ def _level(atlas: np.ndarray, start: int, size: int, mirrored: bool, u: float, v
         out[c] += scale * (w00 * atlas[p00 + c] + w01 * atlas[p01 + c] + w10 * atlas[p10 + c] + w11 * atlas[p11 + c])
 
 
-@rowwise
+@scalar
 def _texture(
-    atlas: np.ndarray, start: int, size: int, mirrored: bool, u: float, v: float, lod: float, weight: float, out: np.ndarray
+    atlas: np.ndarray, start: int, size: int, mirrored: bool, u: float, v: float, texels: float, weight: float, out: np.ndarray
 ) -> None:
-    """Add `weight` times a texture's value, interpolated between its two copies nearest to level `lod`."""
-    lod = max(lod, 0.0)
-    level = int(lod)
-    mix = lod - level
-    for _ in range(level):
-        if size > 1:
-            start += 3 * size * size
-            size >>= 1
-    if mix < 0.05 or size == 1:
+    """Add `weight` times a texture's value; `texels` of the largest copy lie under the pixel, and choose the copies.
+
+    Between two copies the mix is linear in the texels, close to a logarithm's and much cheaper.
+    """
+    while texels >= 2.0 and size > 1:
+        texels *= 0.5
+        start += 3 * size * size
+        size >>= 1
+    mix = texels - 1.0
+    if mix < 0.15 or size == 1:
         _level(atlas, start, size, mirrored, u, v, weight, out)
-    elif mix > 0.95:
+    elif mix > 0.85:
         _level(atlas, start + 3 * size * size, size >> 1, mirrored, u, v, weight, out)
     else:
         _level(atlas, start, size, mirrored, u, v, weight * (1.0 - mix), out)
         _level(atlas, start + 3 * size * size, size >> 1, mirrored, u, v, weight * mix, out)
 
 
-@rowwise
+@scalar
 def _sky(
     atlas: np.ndarray, size: int, horizon: np.ndarray, zenith: np.ndarray, ground: np.ndarray, cloud_strength: float,
     dx: float, dy: float, dz: float, out: np.ndarray,
@@ -106,13 +113,13 @@ def _sky(
     mix = min(1.0, 1.4 * math.sqrt(-dy))
     out[0] = out[1] = out[2] = 0.0
     reach = 0.25 / (0.12 - dy)
-    _texture(atlas, 0, size, True, dx * reach, dz * reach, 1.0 + 2.0 * (1.0 - mix), 1.0, out)
+    _texture(atlas, 0, size, True, dx * reach, dz * reach, 2.0 + 6.0 * (1.0 - mix), 1.0, out)
     for c in range(3):
         cloud = 1.0 + cloud_strength * mix * (2.0 * out[c] - 1.0)
         out[c] = ((1.0 - mix) * horizon[c] + mix * zenith[c]) * max(cloud, 0.05)
 
 
-@rowwise
+@scalar
 def _lit(depth: np.ndarray, pose: np.ndarray, focal: float, bias_m: float, px: float, py: float, pz: float) -> float:
     """Share of the light's four nearest shadow-map rays that reach the world point."""
     size = depth.shape[0]
@@ -134,59 +141,39 @@ def _lit(depth: np.ndarray, pose: np.ndarray, focal: float, bias_m: float, px: f
 
 
 @rowwise
-def shading_points(
-    hit: np.ndarray, inverse_depth: np.ndarray, surface: np.ndarray, pixel: np.ndarray, ray: np.ndarray, weight: np.ndarray
-) -> int:
-    """Which rays are shaded, and with which share of their pixel; see the module.
+def find_edges(hit: np.ndarray, inverse_depth: np.ndarray, surface: np.ndarray, edge: np.ndarray) -> None:
+    """Mark in `edge` (H, W) bool the pixels beside which another surface, or another part of the same one, begins."""
+    height, width = hit.shape
+    for row in range(height):
+        for column in range(width):
+            here, near = hit[row, column], inverse_depth[row, column]
+            for down, right in ((0, 1), (1, 0)):
+                y, x = row + down, column + right
+                if y < height and x < width and hit[y, x] != here:
+                    there, other = hit[y, x], inverse_depth[y, x]
+                    if here < 0 or there < 0 or surface[here] != surface[there] or abs(near - other) > 0.1 * max(near, other):
+                        edge[row, column] = edge[y, x] = True
 
-    Parameters
-    ----------
-    hit, inverse_depth : ndarray (H * W, K)
-        What each pixel's rays meet; the first ray is the centre's.
-    surface : ndarray (N,)
-        Smooth surface of each triangle.
-    pixel, ray : ndarray int32, weight : ndarray float32, written
 
-    Returns
-    -------
-    int
-        Number of entries written, at most ``H * W * max(1, K - 1)``.
-    """
-    used, count = 0, hit.shape[1]
-    for i in range(hit.shape[0]):
-        first, near = hit[i, 0], inverse_depth[i, 0]
-        own = surface[first] if first >= 0 else -1
-        one_surface = True
-        for k in range(1, count):
-            other = hit[i, k]
-            if other != first and (other < 0 or surface[other] != own):
-                one_surface = False
-            if abs(inverse_depth[i, k] - near) > 0.1 * near:
-                one_surface = False
-        if one_surface:
-            pixel[used], ray[used], weight[used] = i, 0, 1.0
-            used += 1
-            continue
-        begin = used
-        for k in range(1, count):
-            own = surface[hit[i, k]] if hit[i, k] >= 0 else -1
-            for j in range(begin, used):  # a surface that another ray of this pixel met is not shaded again
-                before = hit[i, ray[j]]
-                if (surface[before] if before >= 0 else -1) == own:
-                    weight[j] += 1.0 / (count - 1)
+@rowwise
+def merge_rays(hit: np.ndarray, surface: np.ndarray, count: int, weight: np.ndarray) -> None:
+    """Of each pixel's `count` consecutive rays keep the first on every surface; `weight` (R,) becomes its share of the pixel."""
+    for first in range(0, hit.size, count):
+        for k in range(first, first + count):
+            own = surface[hit[k]] if hit[k] >= 0 else -1
+            weight[k] = 0.0
+            for j in range(first, k + 1):
+                if (surface[hit[j]] if hit[j] >= 0 else -1) == own:
+                    weight[j] += 1.0 / count
                     break
-            else:
-                pixel[used], ray[used], weight[used] = i, k, 1.0 / (count - 1)
-                used += 1
-    return used
 
 
 @rowwise
 def shade(
-    s: Surfaces, light: Illumination, pose: np.ndarray, intrinsics: np.ndarray, offsets: np.ndarray, hit: np.ndarray,
-    pixel: np.ndarray, ray: np.ndarray, weight: np.ndarray, image: np.ndarray,
+    s: Surfaces, light: Illumination, pose: np.ndarray, intrinsics: np.ndarray, x_of: np.ndarray, y_of: np.ndarray,
+    hit: np.ndarray, weight: np.ndarray, image: np.ndarray,
 ) -> None:  # fmt: skip
-    """Add the radiance of the chosen rays to an image.
+    """Add the radiance along rays to an image.
 
     Parameters
     ----------
@@ -194,11 +181,12 @@ def shade(
         World to camera.
     intrinsics : ndarray (4,)
         fx, fy, cx, cy in pixels.
-    offsets : ndarray (K, 2)
-        Rays of each pixel relative to its centre.
-    hit : ndarray (H * W, K)
-    pixel, ray, weight : ndarray (P,)
-        From `shading_points`.
+    x_of, y_of : ndarray (R,)
+        Rays in pixels.
+    hit : ndarray (R,) int32
+        What they meet.
+    weight : ndarray (R,)
+        Their shares of the pixels that they fall in; rays of weight 0 are skipped.
     image : ndarray (H, W, 3) float32, written
     """
     plane, corners, normals, uv, material_of, materials = s.plane, s.corners, s.normals, s.uv, s.material, s.materials
@@ -208,11 +196,11 @@ def shade(
     out, work, eye = np.empty(3), np.empty(3), np.empty(3)
     for i in range(3):
         eye[i] = -(pose[0, i] * pose[0, 3] + pose[1, i] * pose[1, 3] + pose[2, i] * pose[2, 3])
-    width = image.shape[1]
-    for point in range(pixel.size):
-        row, column = pixel[point] // width, pixel[point] % width
-        x, y = column + offsets[ray[point], 0], row + offsets[ray[point], 1]
-        n, share = hit[pixel[point], ray[point]], weight[point]
+    for ray in range(hit.size):
+        n, share, x, y = hit[ray], weight[ray], x_of[ray], y_of[ray]
+        if share == 0.0:
+            continue
+        row, column = int(y + 0.5), int(x + 0.5)
         if n < 0:
             rx, ry = (x - intrinsics[2]) / intrinsics[0], (y - intrinsics[3]) / intrinsics[1]
             scale = 1.0 / math.sqrt(rx * rx + ry * ry + 1.0)
@@ -261,7 +249,7 @@ def shade(
         tu, tv = a[0, 0] * u + a[0, 1] * v + a[0, 2], a[1, 0] * u + a[1, 1] * v + a[1, 2]
         stretch = math.sqrt(a[0, 0] * a[0, 0] + a[1, 0] * a[1, 0])
         taps = 1 if major < 1.6 * minor else (2 if major < 4.0 * minor else 4)
-        lod = math.log2(max(max(major / taps, minor) * stretch * atlas_size[index], 1e-9)) - 0.2
+        texels = _SHARPNESS * max(major / taps, minor) * stretch * atlas_size[index]
         du, dv = (ux, vx) if across >= down else (uy, vy)
         step_u, step_v = a[0, 0] * du + a[0, 1] * dv, a[1, 0] * du + a[1, 1] * dv
         work[0] = work[1] = work[2] = 0.0
@@ -269,17 +257,18 @@ def shade(
             along = (tap + 0.5) / taps - 0.5
             _texture(
                 atlas, atlas_start[index], atlas_size[index], atlas_mirrored[index],
-                tu + along * step_u, tv + along * step_v, lod, 1.0 / taps, work,
+                tu + along * step_u, tv + along * step_v, texels, 1.0 / taps, work,
             )  # fmt: skip
         blue, green, red = work[0], work[1], work[2]
         grain = 1.0
         if material.detail_strength > 0.0:
             index, fine = material.detail, material.detail_scale
-            lod = math.log2(max(math.sqrt(major * minor) * fine * atlas_size[index], 1e-9)) - 0.2
-            if lod < 7.0:
+            texels = _SHARPNESS * math.sqrt(major * minor) * fine * atlas_size[index]
+            fade = min(1.0, 2.0 - texels / 64.0)  # far away the fine texture is below the pixel
+            if fade > 0.0:
                 work[0] = work[1] = work[2] = 0.0
-                _texture(atlas, atlas_start[index], atlas_size[index], atlas_mirrored[index], u * fine, v * fine, lod, 1.0, work)
-                grain = max(1.0 + min(1.0, 7.0 - lod) * material.detail_strength * (2.0 * work[1] - 1.0), 0.0)
+                _texture(atlas, atlas_start[index], atlas_size[index], atlas_mirrored[index], u * fine, v * fine, texels, 1.0, work)
+                grain = max(1.0 + fade * material.detail_strength * (2.0 * work[1] - 1.0), 0.0)
 
         # light
         lx, ly, lz = light.position[0] - px, light.position[1] - py, light.position[2] - pz
@@ -297,8 +286,9 @@ def shade(
             if strength > 0.0 and lit > 0.0:
                 hx, hy, hz = lx + ex, ly + ey, lz + ez
                 half = (nx * hx + ny * hy + nz * hz) / math.sqrt(hx * hx + hy * hy + hz * hz + 1e-12)
-                if half > 0.0:
-                    highlight = strength * lit * half**material.shininess
+                fall = material.shininess * (1.0 - half)
+                if fall < 7.0:  # a Gaussian on the sphere, close to half ** shininess
+                    highlight = strength * lit * math.exp(-fall)
         up = 0.5 - 0.5 * ny
         bgr = material.color
         for channel in range(3):
@@ -319,15 +309,30 @@ def shade(
 
 
 def shade_image(
-    s: Surfaces, light: Illumination, pose: np.ndarray, intrinsics: np.ndarray, offsets: np.ndarray,
-    hit: np.ndarray, inverse_depth: np.ndarray,
-) -> np.ndarray:  # fmt: skip
-    """Radiance (H, W, 3) float32 of an image from `Caster.pattern`'s (H, W, K) hits; parameters as in `shade`."""
-    height, width, count = hit.shape
-    hit, inverse_depth = hit.reshape(-1, count), inverse_depth.reshape(-1, count)
-    most = height * width * max(1, count - 1)
-    pixel, ray, weight = np.empty(most, np.int32), np.empty(most, np.int32), np.empty(most, np.float32)
-    used = shading_points(hit, inverse_depth, s.surface, pixel, ray, weight)
-    image = np.zeros((height, width, 3), np.float32)
-    shade(s, light, pose, intrinsics, offsets, hit, pixel[:used], ray[:used], weight[:used], image)
+    s: Surfaces, light: Illumination, caster: Caster, inverse_depth: np.ndarray, hit: np.ndarray, offsets: np.ndarray
+) -> np.ndarray:
+    """Radiance (H, W, 3) float32 of an image.
+
+    Parameters
+    ----------
+    caster : Caster
+        The camera.
+    inverse_depth, hit : ndarray (H, W)
+        From `Caster.centres`.
+    offsets : ndarray (K, 2)
+        Rays of a pixel at an edge relative to its centre; none for an image without anti-aliasing.
+    """
+    edge = np.zeros(hit.shape, bool)
+    if len(offsets):
+        find_edges(hit, inverse_depth, s.surface, edge)
+    image = np.zeros((*hit.shape, 3), np.float32)
+    pixels = np.flatnonzero(edge)
+    inside = (~edge).ravel().astype(np.float32)
+    y, x = np.divmod(np.arange(hit.size, dtype=np.int32), np.int32(hit.shape[1]))
+    shade(s, light, caster.pose, caster.intrinsics, x.astype(float), y.astype(float), hit.ravel(), inside, image)
+    if len(pixels):
+        x, y, hit = caster.within(pixels, offsets)
+        weight = np.empty(hit.size, np.float32)
+        merge_rays(hit, s.surface, len(offsets), weight)
+        shade(s, light, caster.pose, caster.intrinsics, x, y, hit, weight, image)
     return image

@@ -4,11 +4,13 @@ The road runs along +z at y = 0; the camera is `camera height` above it and look
 come pavements or verges, parked cars, furniture, trees, and house fronts; vehicles and people move on their own.
 """
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from cgsf.synthetic import props
-from cgsf.synthetic.materials import paint, tinted, upright
-from cgsf.synthetic.meshes import box, hull, polygon
+from cgsf.synthetic.materials import Wardrobe, paint, tinted, upright
+from cgsf.synthetic.meshes import box, boxes, hull, join, polygon
 from cgsf.synthetic.patterns import color
 from cgsf.synthetic.props import Placement
 from cgsf.synthetic.scene import CameraPath, Light, Material, Scene, Sky
@@ -26,8 +28,8 @@ def street(rng: np.random.Generator, source: TextureSource, height: int, width: 
     lane = rng.uniform(0.2, 0.75) * half_road
     eye = np.array([lane if rng.random() < 0.85 else -lane, -rng.uniform(1.45, 1.85), 0.0])
     turning = rng.random() < 0.3
-    speed = rng.choice([0.0, rng.uniform(0.05, 0.5), rng.uniform(0.4, 1.3), rng.uniform(1.0, 2.2)], p=[0.08, 0.2, 0.5, 0.22])
-    yaw_rate = rng.normal(0, 0.03) if turning else rng.normal(0, 0.004)
+    speed = float(rng.choice([0.0, rng.uniform(0.05, 0.4), rng.uniform(0.3, 1.1), rng.uniform(0.9, 1.7)], p=[0.08, 0.25, 0.5, 0.17]))
+    yaw_rate = rng.normal(0, 0.025) if turning else rng.normal(0, 0.004)
     heading = rng.normal(0, 0.25) if turning else rng.normal(0, 0.05)
     path = CameraPath(
         eye, np.array([rng.normal(0, 0.012), heading, rng.normal(0, 0.01)]), np.array([0.0, rng.normal(0, 0.006), speed]),
@@ -35,21 +37,21 @@ def street(rng: np.random.Generator, source: TextureSource, height: int, width: 
     )  # fmt: skip
     scene = Scene(camera, path, *_daylight(rng, source))
 
-    ids = iter(range(1, 100))
     pavement = rng.uniform(1.2, 4.0)
     urban = rng.random() < 0.72
     _ground(scene, rng, source, half_road, pavement, urban)
     fronts = half_road + pavement + (rng.uniform(0, 3) if urban else rng.uniform(3, 10))
-    leaf = props.foliage_material(rng, source)
+    wardrobe = Wardrobe(source)
     for side in (-1, 1):
         if urban or rng.random() < 0.25:
             _houses(scene, rng, source, side, fronts)
         else:
-            _green(scene, rng, source, side, fronts, leaf)
-        _roadside(scene, rng, source, side, half_road, pavement, leaf, urban)
+            _green(scene, rng, source, side, fronts, wardrobe)
+        _roadside(scene, rng, side, half_road, pavement, wardrobe, urban)
     _horizon(scene, rng, source)
-    _traffic(scene, rng, source, half_road, eye[0], ids)
-    _people(scene, rng, source, half_road, pavement, ids)
+    ids = iter(range(1, 1000))
+    _traffic(scene, rng, wardrobe, eye[0], ids)
+    _people(scene, rng, wardrobe, half_road, pavement, ids)
     return scene
 
 
@@ -98,16 +100,16 @@ def _ground(scene: Scene, rng: np.random.Generator, source: TextureSource, half_
     white = paint(rng, np.full(3, rng.uniform(0.6, 0.95)))
     if rng.random() < 0.7:
         dash, gap = (rng.uniform(1.5, 6), rng.uniform(2, 8)) if rng.random() < 0.75 else (_FAR_M, 1.0)
-        for z in np.arange(near, 90, dash + gap)[:24]:
-            scene.add(polygon(_flat(-0.07, 0.07, z, min(z + dash, _FAR_M), -0.004)), white)
+        dashes = [polygon(_flat(-0.07, 0.07, z, min(z + dash, _FAR_M), -0.004)) for z in np.arange(near, 90, dash + gap)[:24]]
+        scene.add(join(dashes), white)
     if rng.random() < 0.4:
         for side in (-1, 1):
             x = side * (half_road - 0.3)
             scene.add(polygon(_flat(x - 0.06, x + 0.06, near, _FAR_M, -0.004)), white)
     if rng.random() < 0.3:
         z = rng.uniform(6, 30)
-        for x in np.arange(-half_road + 0.4, half_road - 0.5, 1.0):
-            scene.add(polygon(_flat(x, x + 0.5, z, z + 3, -0.004)), white)
+        bars = [polygon(_flat(x, x + 0.5, z, z + 3, -0.004)) for x in np.arange(-half_road + 0.4, half_road - 0.5, 1.0)]
+        scene.add(join(bars), white)
     for _ in range(int(rng.integers(0, 8))):  # repairs and covers
         x, z, w, depth = rng.uniform(-half_road, half_road - 1), rng.uniform(3, 30), rng.uniform(0.4, 2.5), rng.uniform(0.5, 6)
         shade = tinted(np.full(3, rng.uniform(0.15, 0.6)), 0.6)
@@ -123,7 +125,6 @@ def _houses(scene: Scene, rng: np.random.Generator, source: TextureSource, side:
         length, floors, storey = rng.uniform(7, 22), int(rng.integers(1, 6)), rng.uniform(2.7, 3.6)
         tall, depth, back = floors * storey + rng.uniform(0.2, 1.5), rng.uniform(6, 12), rng.uniform(0, 2.5) * (not terrace)
         x = side * (front + back)
-        bay = rng.uniform(1.2, 3.5)
         facade = Material(
             source.any("facade") if rng.random() < 0.5 else source.kind("facade"), np.eye(3, 4) * rng.uniform(0.6, 1.15, (3, 1)) ** 0.5,
             1 / (storey * rng.integers(1, 4)), 0.0, (rng.random(), 0.0), source.kind("grain", "masonry", "clouds"), 1 / rng.uniform(0.5, 2), rng.uniform(0, 0.5),
@@ -132,7 +133,7 @@ def _houses(scene: Scene, rng: np.random.Generator, source: TextureSource, side:
         scene.add(box((depth, tall, length)).moved((x + side * depth / 2, -tall / 2, z + length / 2)), facade if rng.random() < 0.8 else wall)
         trim = paint(rng, color(rng, 0.2))
         if rng.random() < 0.6:
-            _windows(scene, rng, side, x, z, length, floors, storey, bay, trim)
+            _windows(scene, rng, side, x, (z, length, floors, storey), trim)
         if rng.random() < 0.6:
             for floor in range(1, floors + 1):
                 scene.add(box((0.3, 0.18, length)).moved((x, -floor * storey, z + length / 2)), trim)
@@ -148,34 +149,38 @@ def _houses(scene: Scene, rng: np.random.Generator, source: TextureSource, side:
         z += length + (0.0 if terrace and rng.random() < 0.8 else rng.uniform(1, 9))
 
 
-def _windows(scene: Scene, rng: np.random.Generator, side: int, x: float, z: float, length: float, floors: int, storey: float, bay: float, trim: Material) -> None:
-    """Windows and balconies that stand out from the wall or lie in it."""
+def _windows(scene: Scene, rng: np.random.Generator, side: int, x: float, house: tuple[float, float, int, float], trim: Material) -> None:
+    """Windows and balconies that stand out from the wall or lie in it; `house` is z, length, floors and storey height."""
+    z, length, floors, storey = house
+    bay = rng.uniform(1.2, 3.5)
     glass = paint(rng, np.full(3, rng.uniform(0.03, 0.2)), 0.5, rng.uniform(0.3, 1.0))
     wide, tall = bay * rng.uniform(0.4, 0.7), storey * rng.uniform(0.4, 0.6)
-    balcony = rng.random() < 0.3
-    for floor in range(min(floors, 3)):
-        y = -(floor + 0.55) * storey
-        for middle in np.arange(z + bay / 2, z + length - bay / 2, bay)[:7]:
-            scene.add(box((0.16, tall + 0.2, wide + 0.2)).moved((x, y, middle)), trim)
-            scene.add(box((0.2, tall, wide)).moved((x, y, middle)), glass)
-            if balcony and floor > 0:
-                scene.add(box((1.0, 0.15, wide + 0.6)).moved((x - side * 0.5, y + tall / 2 + 0.2, middle)), trim)
-                scene.add(box((0.06, 0.9, wide + 0.6)).moved((x - side * 0.95, y + tall / 2 - 0.25, middle)), trim)
+    columns, rows = np.arange(z + bay / 2, z + length - bay / 2, bay)[:8], -(np.arange(min(floors, 4)) + 0.55) * storey
+    middles = np.array([(x, y, column) for y in rows for column in columns])
+    if len(middles) == 0:
+        return
+    scene.add(boxes((0.16, tall + 0.2, wide + 0.2), middles), trim)
+    scene.add(boxes((0.2, tall, wide), middles), glass)
+    if rng.random() < 0.3 and len(rows) > 1:
+        upper = middles[len(columns) :]
+        scene.add(boxes((1.0, 0.15, wide + 0.6), upper + (-side * 0.5, tall / 2 + 0.2, 0)), trim)
+        scene.add(boxes((0.06, 0.9, wide + 0.6), upper + (-side * 0.95, tall / 2 - 0.25, 0)), trim)
 
 
-def _green(scene: Scene, rng: np.random.Generator, source: TextureSource, side: int, front: float, leaf: Material) -> None:
+def _green(scene: Scene, rng: np.random.Generator, source: TextureSource, side: int, front: float, wardrobe: Wardrobe) -> None:
     """Trees, hedges and banks in place of houses."""
     for z in np.arange(rng.uniform(2, 8), 80, rng.uniform(6, 14))[:9]:
-        x = side * (front + rng.uniform(0, 8))
-        props.tree(scene, rng, source, Placement(np.array([x, 0, z + rng.normal(0, 1.5)]), rng.uniform(0, 6)), leaf if rng.random() < 0.6 else None)
+        foot = (side * (front + rng.uniform(0, 8)), 0.0, z + rng.normal(0, 1.5))
+        Placement(foot, rng.uniform(0, 6)).put(scene, props.tree(rng), wardrobe.roadside())
     bank = rng.uniform(0, 4)
     if bank > 1:
-        corners = np.array([(side * (front + 6), 0.2, -10), (side * (front + 6), 0.2, 150), (side * (front + 18), -bank, 150), (side * (front + 18), -bank, -10)])
+        near, far = side * (front + 6), side * (front + 18)
+        corners = np.array([(near, 0.2, -10), (near, 0.2, 150), (far, -bank, 150), (far, -bank, -10)])
         scene.add(polygon(corners), upright(source, 3.0, "foliage", recolor=False))
 
 
 def _roadside(
-    scene: Scene, rng: np.random.Generator, source: TextureSource, side: int, half_road: float, pavement: float, leaf: Material, urban: bool
+    scene: Scene, rng: np.random.Generator, side: int, half_road: float, pavement: float, wardrobe: Wardrobe, urban: bool
 ) -> None:
     """Parked cars, trees, poles, signs, fences, bins along one side."""
     if rng.random() < (0.65 if urban else 0.2):
@@ -183,21 +188,22 @@ def _roadside(
         while z < 70:
             if rng.random() < 0.75:
                 yaw = (0.0 if side > 0 else np.pi) + rng.normal(0, 0.03)
-                kind = props.car if rng.random() < 0.93 else props.truck
-                kind(scene, rng, source, Placement(np.array([x, 0, z]), yaw))
+                prop = props.car(rng) if rng.random() < 0.93 else props.truck(rng)
+                Placement((x, 0.0, z), yaw).put(scene, prop, wardrobe.vehicle())
             z += rng.uniform(5.0, 8.0) if z < 40 else rng.uniform(8, 14)
     middle = side * (half_road + rng.uniform(0.4, 0.8))
     if rng.random() < 0.45:
         for z in np.arange(rng.uniform(4, 12), 60, rng.uniform(8, 16))[:6]:
-            props.tree(scene, rng, source, Placement(np.array([middle, 0, z]), rng.uniform(0, 6)), leaf)
-    for prop, chance, spacing in ((props.lamp_post, 0.7, 22.0), (props.sign, 0.7, 14.0), (props.small, 0.6, 8.0), (props.bush, 0.4, 7.0)):
+            Placement((middle, 0.0, z), rng.uniform(0, 6)).put(scene, props.tree(rng), wardrobe.roadside())
+    for shape, chance, spacing in ((props.lamp_post, 0.7, 22.0), (props.sign, 0.7, 14.0), (props.small, 0.6, 8.0), (props.bush, 0.4, 7.0)):
         if rng.random() < chance:
             for z in np.arange(rng.uniform(2, spacing), 55, spacing * rng.uniform(0.6, 1.4))[:7]:
-                x = middle + side * rng.uniform(0, max(pavement - 0.8, 0.1)) * (prop is not props.lamp_post)
-                prop(scene, rng, source, Placement(np.array([x, -0.05, z]), np.pi if prop is props.lamp_post else rng.normal(0, 0.2)))
+                x = middle + side * rng.uniform(0, max(pavement - 0.8, 0.1)) * (shape is not props.lamp_post)
+                yaw = side * np.pi / -2 if shape is props.lamp_post else rng.normal(0, 0.2)
+                Placement((x, -0.05, z), yaw).put(scene, shape(rng), wardrobe.roadside())
     if rng.random() < 0.4:
-        start, length = rng.uniform(2, 15), rng.uniform(5, 18)
-        props.fence(scene, rng, source, Placement(np.array([side * (half_road + pavement), -0.05, start])), length)
+        foot = (side * (half_road + pavement), -0.05, rng.uniform(2, 15))
+        Placement(foot).put(scene, props.fence(rng), wardrobe.roadside())
 
 
 def _horizon(scene: Scene, rng: np.random.Generator, source: TextureSource) -> None:
@@ -211,33 +217,36 @@ def _horizon(scene: Scene, rng: np.random.Generator, source: TextureSource) -> N
             scene.add(hull(np.array([(x - w, 1, z), (x + w, 1, z), (x, 1, z + 20), (x - 0.4 * w, -tall, z + 8), (x + 0.3 * w, -tall * 0.8, z + 8)])), material)
 
 
-def _traffic(scene: Scene, rng: np.random.Generator, source: TextureSource, half_road: float, lane: float, ids) -> None:  # type: ignore[no-untyped-def]
+def _traffic(scene: Scene, rng: np.random.Generator, wardrobe: Wardrobe, lane: float, ids: Iterator[int]) -> None:
     """Vehicles ahead, oncoming and crossing, each with its own speed."""
 
     def add(x: float, z: float, yaw: float, speed: float) -> None:
-        kind = props.car if rng.random() < 0.82 else (props.truck if rng.random() < 0.6 else props.cyclist)
+        shape = (props.car, props.truck, props.cyclist)[int(rng.choice(3, p=[0.8, 0.11, 0.09]))]
         rate = rng.normal(0, 0.02) if rng.random() < 0.25 else 0.0
-        kind(scene, rng, source, Placement(np.array([x, 0, z]), yaw, speed, rate, next(ids)))
+        Placement((x, 0.0, z), yaw, speed, rate, next(ids)).put(scene, shape(rng), wardrobe.vehicle())
 
     z = rng.uniform(7, 25)
     while z < 60 and rng.random() < 0.75:  # ahead
-        add(lane + rng.normal(0, 0.2), z, rng.normal(0, 0.03), rng.uniform(0.1, 1.8))
+        add(lane + rng.normal(0, 0.2), z, rng.normal(0, 0.03), rng.uniform(0.1, 1.5))
         z += rng.uniform(9, 30)
-    z = rng.uniform(6, 40)
+    z = rng.uniform(8, 40)
     while z < 80 and rng.random() < 0.7:  # oncoming
-        add(-lane + rng.normal(0, 0.2), z, np.pi + rng.normal(0, 0.03), rng.uniform(0.2, 1.8))
+        add(-lane + rng.normal(0, 0.2), z, np.pi + rng.normal(0, 0.03), rng.uniform(0.2, 1.5))
         z += rng.uniform(8, 30)
-    if rng.random() < 0.3:  # crossing
-        way = rng.choice([-1, 1])
-        add(-way * rng.uniform(-3, 6), rng.uniform(9, 30), way * (np.pi / 2 + rng.normal(0, 0.2)), rng.uniform(0.2, 1.2))
+    if rng.random() < 0.35:  # crossing
+        way = int(rng.choice([-1, 1]))
+        add(-way * rng.uniform(-3, 6), rng.uniform(9, 30), way * (np.pi / 2 + rng.normal(0, 0.2)), rng.uniform(0.2, 1.0))
 
 
-def _people(scene: Scene, rng: np.random.Generator, source: TextureSource, half_road: float, pavement: float, ids) -> None:  # type: ignore[no-untyped-def]
-    """Walkers on the pavements and across the road, cyclists."""
+def _people(
+    scene: Scene, rng: np.random.Generator, wardrobe: Wardrobe, half_road: float, pavement: float, ids: Iterator[int]
+) -> None:
+    """Walkers on the pavements and across the road."""
     for _ in range(int(rng.integers(0, 7))):
-        side = rng.choice([-1, 1])
         crossing = rng.random() < 0.25
-        x = rng.uniform(-half_road, half_road) if crossing else side * (half_road + rng.uniform(0.4, pavement))
-        yaw = rng.choice([-1, 1]) * np.pi / 2 if crossing else rng.choice([0, np.pi]) + rng.normal(0, 0.2)
+        beside = int(rng.choice([-1, 1])) * (half_road + rng.uniform(0.4, pavement))
+        x = rng.uniform(-half_road, half_road) if crossing else beside
+        yaw = int(rng.choice([-1, 1])) * np.pi / 2 if crossing else float(rng.choice([0, np.pi])) + rng.normal(0, 0.2)
         speed = rng.uniform(0.05, 0.2) if rng.random() < 0.8 else 0.0
-        props.person(scene, rng, source, Placement(np.array([x, 0.0 if crossing else -0.08, rng.uniform(5, 35)]), yaw, speed, 0.0, next(ids) if speed else 0))
+        foot = (x, 0.0 if crossing else -0.08, rng.uniform(5, 35))
+        Placement(foot, yaw, speed, 0.0, next(ids) if speed else 0).put(scene, props.person(rng), wardrobe.clothes())

@@ -4,7 +4,6 @@ A texture is square, a power of two wide, and repeats without a seam (photograph
 procedural ones come from a bank: (kind, variant) names one texture for good, made when it is first asked for.
 """
 
-import math
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -21,6 +20,8 @@ VARIANTS = 24
 SIZE = 256
 #: Pixels of a photograph after it has been read.
 PHOTO_SIZE = 512
+#: Variants of each kind, and photographs, that one scene chooses from.
+VARIANTS_PER_SCENE, PHOTOS_PER_SCENE = 3, 8
 _SEED = 20_190_512
 
 
@@ -92,7 +93,7 @@ def photo(path: Path) -> Texture:
 
 
 class TextureSource:
-    """Random textures for one scene.
+    """Random textures for one scene, which has only a few of each kind, as real places do.
 
     Parameters
     ----------
@@ -105,17 +106,18 @@ class TextureSource:
 
     def __init__(self, rng: np.random.Generator, photos: str | Path | None = None, photo_share: float = 0.5) -> None:
         self.rng = rng
-        self.photos = photo_paths(photos) if photos is not None else ()
-        self.photo_share = photo_share if self.photos else 0.0
+        paths = photo_paths(photos) if photos is not None else ()
+        self.photos = [paths[i] for i in rng.integers(len(paths), size=PHOTOS_PER_SCENE)] if paths else []
+        self.photo_share = photo_share if paths else 0.0
+        self.variants = {kind: rng.integers(VARIANTS, size=VARIANTS_PER_SCENE) for kind in sorted(patterns.KINDS)}
 
     def kind(self, *names: str) -> Texture:
         """A random variant of one of the named kinds."""
         name = names[int(self.rng.integers(len(names)))]
-        return procedural(name, int(self.rng.integers(VARIANTS)))
+        return procedural(name, int(self.rng.choice(self.variants[name])))
 
     def any(self, *names: str) -> Texture:
         """A picture now and then, otherwise one of the named kinds (all kinds if none is named)."""
-        use_photo, index = self.rng.random() < self.photo_share, self.rng.random()
-        if use_photo:
-            return photo(self.photos[math.floor(index * len(self.photos))])
+        if self.rng.random() < self.photo_share:
+            return photo(self.photos[int(self.rng.integers(len(self.photos)))])
         return self.kind(*(names or patterns.ANYWHERE))

@@ -18,15 +18,12 @@ class View(NamedTuple):
     Parameters
     ----------
     caster : Caster
-        Triangles in this camera's coordinates.
-    pose : ndarray (4, 4)
-        World to camera.
+        The camera and the triangles.
     inverse_depth, hit : ndarray (H, W)
         What the pixels' centres see: 1 / Z in 1/m (0 for the sky) and the triangle (-1).
     """
 
     caster: Caster
-    pose: np.ndarray
     inverse_depth: np.ndarray
     hit: np.ndarray
 
@@ -71,8 +68,8 @@ def follow(source: View, target: View) -> tuple[np.ndarray, np.ndarray]:
         Inverse depth there in 1/m; 0 for the sky.
     """
     place, there = np.empty((*source.hit.shape, 2)), np.empty(source.hit.shape)
-    turn = target.pose[:3, :3] @ source.pose[:3, :3].T
     caster = source.caster
+    turn = target.caster.pose[:3, :3] @ caster.pose[:3, :3].T
     _follow(source.hit, source.inverse_depth, caster.plane, target.caster.corners, turn, caster.intrinsics, place, there)
     return place, there
 
@@ -80,7 +77,7 @@ def follow(source: View, target: View) -> tuple[np.ndarray, np.ndarray]:
 def seen(target: View, place: np.ndarray, inverse_depth: np.ndarray) -> np.ndarray:
     """True where the target camera sees the points from `follow`: inside the image and nothing nearer, (H, W) bool."""
     x, y = place[..., 0].ravel(), place[..., 1].ravel()
-    nearest, _ = target.caster.nearest(x, y)
+    nearest = target.caster.nearest(x, y)
     with np.errstate(invalid="ignore"):
         inside = (x >= 0) & (y >= 0) & (x <= target.caster.width - 1) & (y <= target.caster.height - 1)
         return (inside & (inverse_depth.ravel() >= nearest * (1 - 1e-6))).reshape(inverse_depth.shape)
