@@ -1,0 +1,128 @@
+"""From a start to a state in which every pixel moves as it was seen to, or as something rigid does.
+
+The order of things: correspondences of the start -> rigid motions -> a choice per pixel between measured and rigid
+motion -> unmatched disparities filled again, now with the second time's evidence -> the choice once more.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from variational.camera import StereoCamera
+from variational.evidence import EvidenceConfig, refill
+from variational.fusion import FusionConfig, choose, motion_costs
+from variational.initialise import Start, sample
+from variational.matching import MatchingConfig
+from variational.rigid import Correspondences, RigidConfig, RigidMotion, displacement, find_motions, guess_camera
+from variational.state import D1, C, flow_of
+
+MEASURED = -1
+"""Label of pixels that keep their measured motion; 0 is the camera's, 1, 2, ... the objects'."""
+
+
+@dataclass(frozen=True, eq=False)
+class Proposal:
+    """A fused state.
+
+    Parameters
+    ----------
+    state : np.ndarray
+        (5, H, W) float32.
+    labels : np.ndarray
+        (H, W) int: index into `motions`, MEASURED where the start's own motion was kept.
+    motions : list of RigidMotion
+        The camera's first; empty where no rigid motion was found, and then nothing was changed.
+    cost : np.ndarray
+        (H, W) float32 in [0, 1]: how badly the census words agree where the chosen motion leads.
+    """
+
+    state: np.ndarray
+    labels: np.ndarray
+    motions: list[RigidMotion]
+    cost: np.ndarray
+
+
+def correspondences(start: Start, tolerance_px: float = 1.0) -> Correspondences:
+    """Where matched points of left1 went: flow that leads back within `tolerance_px` to points matched at both times."""
+    flow = flow_of(start.state)
+    height, width = flow.shape[:2]
+    x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+    to_x, to_y = x + flow[..., 0], y + flow[..., 1]
+    inside = (to_x >= 0) & (to_x <= width - 1) & (to_y >= 0) & (to_y <= height - 1)
+    there_and_back = np.linalg.norm(flow + sample(start.backward_flow, flow), axis=-1)
+    matched2 = sample(start.match2.matched.astype(np.float32), flow) > 0.99
+    valid = inside & (there_and_back < tolerance_px) & start.match1.matched & matched2
+    second_disparity = sample(start.match2.disparity, flow)
+    return Correspondences(np.dstack([x, y, start.state[D1]]), np.dstack([to_x, to_y, second_disparity]), valid)
+
+
+def _nearby(motions: list[RigidMotion], slots: int = 3) -> np.ndarray:
+    """(slots, H, W) int: the objects nearest to each pixel, nearest first, MEASURED where there are none near.
+
+    Near is within half of the object's own size: what moves with it but could not be matched lies around it.
+    """
+    distances = []
+    for motion in motions[1:]:
+        distance = cv2.distanceTransform((~motion.support).astype(np.uint8), cv2.DIST_L2, 3)
+        distance[distance > 0.6 * np.sqrt(motion.support.sum()) + 15] = np.inf
+        distances.append(distance)
+    if not distances:
+        return np.empty((0, *motions[0].support.shape), np.int32)
+    stack = np.stack(distances)
+    order = np.argsort(stack, axis=0, kind="stable")[:slots]
+    return np.where(np.isfinite(np.take_along_axis(stack, order, 0)), order + 1, MEASURED).astype(np.int32)
+
+
+def propose(
+    start: Start, grey: np.ndarray, camera: StereoCamera | None, matching: MatchingConfig, rigid: RigidConfig,
+    fusion: FusionConfig, evidence: EvidenceConfig,
+) -> Proposal:  # fmt: skip
+    """Fuse the start with rigid motions.
+
+    Parameters
+    ----------
+    start : Start
+    grey : np.ndarray
+        (H, W) float32, left1.
+    camera : StereoCamera or None
+        With it the motions are metric; without, see variational.rigid.
+
+    Returns
+    -------
+    Proposal
+    """
+    matches = correspondences(start)
+    motions = find_motions(matches, camera or guess_camera(matches, rigid), rigid)
+    nothing = np.full(grey.shape, MEASURED, np.int32)
+    if not motions:
+        return Proposal(start.state, nothing, [], np.zeros(grey.shape, np.float32))
+    words = (start.match1.words_left, start.match2.words_left, start.match2.words_right)
+    labels_of = np.concatenate([nothing[None], nothing[None] + 1, _nearby(motions)])
+    homographies = np.stack([motion.homography for motion in motions])
+    state = start.state.copy()
+    for final in (False, True):
+        candidates = _candidates(state, start, motions, labels_of)
+        costs = motion_costs(candidates, state[D1], words, fusion)
+        biased = costs.copy()
+        biased[0] += fusion.measured_prior
+        biased[2:] += fusion.object_prior
+        chosen = choose(candidates, biased, state[D1], grey, fusion)[None]
+        labels = np.take_along_axis(labels_of, chosen, 0)[0]
+        if not final:
+            state[D1] = refill(start.match1, start.match2, grey, labels, homographies, matching, evidence)
+    state[C:] = np.take_along_axis(candidates, chosen[:, None], 0)[0]
+    return Proposal(state, labels, motions, np.take_along_axis(costs, chosen, 0)[0])
+
+
+def _candidates(state: np.ndarray, start: Start, motions: list[RigidMotion], labels_of: np.ndarray) -> np.ndarray:
+    """(K, 3, H, W): disparity change, u, v of the measured motion, the camera's, and of the objects near each pixel."""
+    candidates = np.full((len(labels_of), 3, *state.shape[1:]), np.nan, np.float32)
+    flow = flow_of(start.state)
+    candidates[0, 0] = sample(start.match2.disparity, flow) - state[D1]
+    candidates[0, 1:] = start.state[C + 1 :]
+    for index, motion in enumerate(motions):
+        moved = displacement(motion.homography, state[D1])
+        for k in range(1, len(labels_of)):
+            np.copyto(candidates[k], moved, where=labels_of[k] == index)
+    return candidates

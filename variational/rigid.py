@@ -1,0 +1,283 @@
+"""Rigid motions between the two times, fitted to stereo and flow correspondences.
+
+Most of the world moves rigidly, and where two images cannot be compared (occlusion, pixels that leave the view) the
+rigid motion of what surrounds them is all there is. A motion T acts on (x, y, disparity, 1) as the homography
+``P T P^-1``, P being the camera's projection (Demirdjian and Darrell 2001). Fits are robust: three-point RANSAC on the
+image motion, then iteratively re-weighted Gauss-Newton on image motion and disparity together.
+
+Without a calibration the principal point is taken at the image's centre, and the focal length is the one, of a few, under
+which the correspondences move most rigidly; the baseline is arbitrary, it only scales the translation.
+"""
+
+import logging
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from variational.camera import StereoCamera
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class RigidConfig:
+    """Rigid-motion proposals.
+
+    Parameters
+    ----------
+    max_objects : int
+        Motions sought beside the camera's; 0 for none.
+    tolerance_px : float
+        A correspondence follows a motion if its predicted (x, y, disparity) is this close.
+    points : int
+        Correspondences used in one fit, drawn evenly.
+    min_points : int
+        A fit to fewer correspondences is not tried.
+    min_object : float
+        Smallest object, as a share of the image.
+    min_inliers : float
+        Share of an object's correspondences that its motion must explain.
+    """
+
+    max_objects: int = 12
+    tolerance_px: float = 2.0
+    points: int = 4000
+    min_points: int = 60
+    min_object: float = 0.0006
+    min_inliers: float = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Correspondences:
+    """Points of left1 with their place at time 2.
+
+    Parameters
+    ----------
+    first, second : np.ndarray
+        (H, W, 3) float32, (x, y, disparity) at time 1 and 2, in pixels.
+    valid : np.ndarray
+        (H, W) bool, where both are matched and consistent.
+    """
+
+    first: np.ndarray
+    second: np.ndarray
+    valid: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class RigidMotion:
+    """One motion and the points that it was found on.
+
+    Parameters
+    ----------
+    transform : np.ndarray
+        (4, 4) float64; takes a point at time 1 to time 2, both in the left camera's frame.
+    homography : np.ndarray
+        (4, 4) float64; the same on (x, y, disparity, 1).
+    support : np.ndarray
+        (H, W) bool, the correspondences that follow it.
+    """
+
+    transform: np.ndarray
+    homography: np.ndarray
+    support: np.ndarray
+
+
+def displacement(homography: np.ndarray, disparity: np.ndarray) -> np.ndarray:
+    """Motion that a homography of image-and-disparity space gives to each pixel.
+
+    Parameters
+    ----------
+    homography : np.ndarray
+        (4, 4), see RigidMotion.
+    disparity : np.ndarray
+        (H, W) at time 1, pixels.
+
+    Returns
+    -------
+    np.ndarray
+        (3, H, W) float32: disparity change, u, v in the state's order; NaN where a point goes behind the camera.
+    """
+    height, width = disparity.shape
+    x, y = np.arange(width, dtype=np.float32)[None], np.arange(height, dtype=np.float32)[:, None]
+    h = homography.astype(np.float32)
+    rows = [h[i, 0] * x + h[i, 1] * y + (h[i, 2] * disparity + h[i, 3]) for i in range(4)]
+    scale = np.where(rows[3] > 0, rows[3], np.nan)
+    return np.stack([rows[2] / scale - disparity, rows[0] / scale - x, rows[1] / scale - y])
+
+
+def _project(points: np.ndarray, projection: np.ndarray) -> np.ndarray:
+    """(N, 3) points in metres -> (N, 3) of x, y, disparity."""
+    image = points @ projection[:, :3].T + projection[:, 3]
+    return image[:, :3] / image[:, 3:]
+
+
+def fit_motion(first: np.ndarray, second: np.ndarray, projection: np.ndarray, iterations: int = 5) -> np.ndarray | None:
+    """Rigid motion between two sets of points in image-and-disparity space.
+
+    Parameters
+    ----------
+    first, second : np.ndarray
+        (N, 3) float64, (x, y, disparity > 0), pixels.
+    projection : np.ndarray
+        (4, 4), StereoCamera.projection().
+    iterations : int
+        Gauss-Newton steps after RANSAC.
+
+    Returns
+    -------
+    np.ndarray or None
+        (4, 4) rigid transform; None where no three points agree with others or the points do not fix a motion.
+    """
+    points = _project(first, np.linalg.inv(projection))
+    camera_matrix = np.array([[projection[0, 0], 0, projection[0, 2]], [0, projection[1, 1], projection[1, 2]], [0, 0, 1]])
+    try:
+        found, rotation, translation, inliers = cv2.solvePnPRansac(
+            points, np.ascontiguousarray(second[:, :2]), camera_matrix, None,
+            iterationsCount=200, reprojectionError=1.0, confidence=0.999, flags=cv2.SOLVEPNP_AP3P,
+        )  # fmt: skip
+    except cv2.error:  # what OpenCV says of degenerate points
+        return None
+    if not found or inliers is None:
+        return None
+    transform = np.eye(4)
+    transform[:3, :3], transform[:3, 3] = cv2.Rodrigues(rotation)[0], translation[:, 0]
+    return _gauss_newton(transform, points, second, projection, iterations)
+
+
+def _gauss_newton(
+    transform: np.ndarray, points: np.ndarray, second: np.ndarray, projection: np.ndarray, iterations: int, scale_px: float = 0.7
+) -> np.ndarray | None:
+    """Minimise the Geman-McClure penalty of the distance in (x, y, disparity) over a twist from the left."""
+    fx, fy, fb = projection[0, 0], projection[1, 1], projection[2, 3]
+    for _ in range(iterations):
+        moved = points @ transform[:3, :3].T + transform[:3, 3]
+        X, Y, Z = moved.T
+        with np.errstate(divide="ignore", invalid="ignore"):
+            residual = _project(moved, projection) - second
+            weight = 1 / (1 + (residual**2).sum(axis=1) / scale_px**2) ** 2
+            usable = (Z > 0) & np.isfinite(weight)
+        X, Y, Z, residual, weight = X[usable], Y[usable], Z[usable], residual[usable], weight[usable]
+        if len(Z) < 6:
+            return None
+        zero, root = np.zeros_like(Z), np.sqrt(weight)
+        # derivative of (x, y, disparity) by translation (3) and rotation (3)
+        jacobian = np.stack([
+            np.stack([fx / Z, zero, -fx * X / Z**2, -fx * X * Y / Z**2, fx * (1 + X**2 / Z**2), -fx * Y / Z], axis=1),
+            np.stack([zero, fy / Z, -fy * Y / Z**2, -fy * (1 + Y**2 / Z**2), fy * X * Y / Z**2, fy * X / Z], axis=1),
+            np.stack([zero, zero, -fb / Z**2, -fb * Y / Z**2, fb * X / Z**2, zero], axis=1),
+        ])  # fmt: skip
+        jacobian = (jacobian * root[None, :, None]).reshape(-1, 6)
+        weighted = (residual.T * root).ravel()
+        normal = jacobian.T @ jacobian
+        scaling = np.sqrt(np.diag(normal))
+        if not scaling.all() or np.linalg.cond(normal / np.outer(scaling, scaling)) > 1e12:
+            return None
+        step = -np.linalg.solve(normal, jacobian.T @ weighted)
+        update = np.eye(4)
+        update[:3, :3], update[:3, 3] = cv2.Rodrigues(step[3:])[0], step[:3]
+        transform = update @ transform
+    return transform
+
+
+def _thin(valid: np.ndarray, count: int) -> np.ndarray:
+    """(n,) flat indices of at most `count` of the set pixels, evenly spread."""
+    indices = np.flatnonzero(valid)
+    return indices[np.linspace(0, len(indices) - 1, count).astype(np.intp)] if len(indices) > count else indices
+
+
+def guess_camera(matches: Correspondences, config: RigidConfig) -> StereoCamera:
+    """A camera to fit rigid motions with where none is known; see the module's text."""
+    height, width = matches.valid.shape
+    candidates = [StereoCamera(f * width, f * width, (width - 1) / 2, (height - 1) / 2, 0.1) for f in (0.7, 1.0, 1.4, 2.0)]
+    chosen = _thin(matches.valid & (matches.first[..., 2] > 0.5), config.points)
+    if len(chosen) < config.min_points:
+        return candidates[1]
+    first, second = (m.reshape(-1, 3)[chosen].astype(np.float64) for m in (matches.first, matches.second))
+    errors = []
+    for camera in candidates:
+        transform = fit_motion(first, second, camera.projection())
+        if transform is None:
+            errors.append(np.inf)
+            continue
+        distance = np.linalg.norm(_apply(_homography(transform, camera), first) - second, axis=1)
+        errors.append(np.minimum(distance, config.tolerance_px).mean())
+    return candidates[int(np.argmin(errors))]
+
+
+def _homography(transform: np.ndarray, camera: StereoCamera) -> np.ndarray:
+    projection = camera.projection()
+    return projection @ transform @ np.linalg.inv(projection)
+
+
+def _apply(homography: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """(N, 3) points in image-and-disparity space, moved."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return _project(points, homography)
+
+
+def find_motions(matches: Correspondences, camera: StereoCamera, config: RigidConfig) -> list[RigidMotion]:
+    """The camera's motion and those of moving objects.
+
+    The camera's motion is the one that most correspondences follow. What is left over is cut into connected pieces at
+    jumps of disparity or motion; every piece that is large enough gets a fit of its own, largest first, and takes the
+    correspondences that follow it out of the rest. Pieces that are too small or whose fit explains too little are
+    dropped: no object is invented.
+
+    Returns
+    -------
+    list of RigidMotion
+        The camera's first; empty where there are too few correspondences or no rigid motion explains them.
+    """
+    projection = camera.projection()
+    first, second = (m.reshape(-1, 3) for m in (matches.first, matches.second))
+    left = matches.valid & (matches.first[..., 2] > 0.5) & (matches.second[..., 2] > 0.5)
+
+    def fit(region: np.ndarray, share: float) -> RigidMotion | None:
+        chosen = _thin(region, config.points)
+        if len(chosen) < config.min_points:
+            return None
+        transform = fit_motion(first[chosen].astype(np.float64), second[chosen].astype(np.float64), projection)
+        if transform is None:
+            return None
+        homography = _homography(transform, camera)
+        support = np.zeros(region.size, bool)
+        indices = np.flatnonzero(left)
+        distance = np.linalg.norm(_apply(homography, first[indices]) - second[indices], axis=1)
+        support[indices] = distance < config.tolerance_px
+        support = support.reshape(region.shape)
+        if np.count_nonzero(support & region) < share * np.count_nonzero(region):
+            return None
+        return RigidMotion(transform, homography, support)
+
+    ego = fit(left, config.min_inliers / 2)  # half of the scene may move
+    if ego is None:
+        logger.info("no rigid camera motion: %d correspondences", np.count_nonzero(left))
+        return []
+    motions = [ego]
+    left &= ~ego.support
+    pieces, order = _pieces(matches, left, config)
+    for label in order:
+        if len(motions) > config.max_objects:
+            break
+        region = (pieces == label) & left
+        if np.count_nonzero(region) < max(config.min_points, config.min_object * left.size):
+            continue
+        motion = fit(region, config.min_inliers)
+        if motion is not None:
+            motions.append(RigidMotion(motion.transform, motion.homography, motion.support & (pieces == label)))
+            left &= ~motion.support
+    return motions
+
+
+def _pieces(matches: Correspondences, left: np.ndarray, config: RigidConfig) -> tuple[np.ndarray, np.ndarray]:
+    """Connected pieces of the pixels `left`: (H, W) labels, and the labels from the largest piece to the smallest."""
+    smooth = left.copy()
+    motion = matches.second - matches.first
+    for axis in (0, 1):
+        jump = np.abs(np.diff(matches.first[..., 2], axis=axis)) + np.abs(np.diff(motion, axis=axis)).sum(axis=-1)
+        smooth[(slice(None),) * axis + (slice(1, None),)] &= jump < 2 * config.tolerance_px
+    opened = cv2.morphologyEx(smooth.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    _, labels, statistics, _ = cv2.connectedComponentsWithStats(opened, connectivity=4)
+    return labels, np.argsort(-statistics[1:, cv2.CC_STAT_AREA], kind="stable")[:64] + 1

@@ -1,0 +1,141 @@
+"""The solver: start, rigid proposals, coarse-to-fine minimisation of the energy."""
+
+import logging
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from variational.camera import StereoCamera
+from variational.evidence import EvidenceConfig
+from variational.frames import Frames
+from variational.fusion import FusionConfig
+from variational.initialise import MIN_SIDE, StartName, initialise, to_grey
+from variational.matching import MatchingConfig
+from variational.proposals import MEASURED, Proposal, propose
+from variational.rigid import RigidConfig
+from variational.visibility import backward_flow, project_visibility
+
+logger = logging.getLogger(__name__)
+Progress = Callable[[str, float], None]
+
+
+@dataclass(frozen=True)
+class SolverConfig:
+    """Everything that the solver can be told.
+
+    Parameters
+    ----------
+    start : {"matching", "opencv", "zero"}
+        Starting state: our census matching and dense inverse search, OpenCV's matching and the same flow, or zero.
+    proposals : bool
+        Fuse the start with rigid motions (variational.proposals).
+    matching, rigid, fusion, evidence
+        Settings of the parts.
+    """
+
+    start: StartName = "matching"
+    proposals: bool = True
+    matching: MatchingConfig = field(default_factory=MatchingConfig)
+    rigid: RigidConfig = field(default_factory=RigidConfig)
+    fusion: FusionConfig = field(default_factory=FusionConfig)
+    evidence: EvidenceConfig = field(default_factory=EvidenceConfig)
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """What the solver found.
+
+    Parameters
+    ----------
+    state : np.ndarray
+        (5, H, W) float32.
+    visible : np.ndarray
+        (H, W) bool, True where left1's pixel is seen in left2.
+    confidence : np.ndarray
+        (H, W) float32 in [0, 1].
+    moving : np.ndarray or None
+        (H, W) bool, True where a pixel does not follow the camera's motion; None where that is not known.
+    camera_motion : np.ndarray or None
+        (4, 4) float64, takes static points from left1's frame to left2's, metres; None without a calibration.
+    initial_state : np.ndarray
+        (5, H, W), where the solver started.
+    backward_flow : np.ndarray
+        (H, W, 2), left2 -> left1 on left2's grid.
+    history : list of dict
+        Energy per level and iteration.
+    reason : str
+        Why the minimisation stopped.
+    seconds : dict
+        Time per stage.
+    """
+
+    state: np.ndarray
+    visible: np.ndarray
+    confidence: np.ndarray
+    moving: np.ndarray | None
+    camera_motion: np.ndarray | None
+    initial_state: np.ndarray
+    backward_flow: np.ndarray
+    history: list[dict]
+    reason: str
+    seconds: dict[str, float]
+
+
+def solve(
+    frames: Frames, config: SolverConfig = SolverConfig(), camera: StereoCamera | None = None, progress: Progress | None = None
+) -> Solution:
+    """Scene flow of two rectified stereo pairs by minimising the consistency energy.
+
+    Parameters
+    ----------
+    frames : Frames
+        At least MIN_SIDE pixels on every side.
+    config : SolverConfig
+    camera : StereoCamera or None
+        Makes rigid motions metric; without one they are fitted up to the camera.
+    progress : callable or None
+        Called with the stage's name and the fraction done.
+
+    Returns
+    -------
+    Solution
+        Finite everywhere.
+
+    Raises
+    ------
+    ValueError
+        If the images are too small.
+    """
+    height, width = frames.left1.shape[:2]
+    if min(height, width) < MIN_SIDE:
+        raise ValueError(f"images of {width} x {height} pixels are too small: the solver needs {MIN_SIDE} on every side")
+    seconds: dict[str, float] = {}
+
+    @contextmanager
+    def stage(name: str, fraction: float) -> Iterator[None]:
+        if progress:
+            progress(name, fraction)
+        begin = time.perf_counter()
+        yield
+        seconds[name] = time.perf_counter() - begin
+
+    grey = to_grey(frames.left1)
+    with stage("start", 0.0):
+        start = initialise(frames, config.start, config.matching)
+    proposal = Proposal(start.state, np.full(grey.shape, MEASURED, np.int32), [], np.zeros(grey.shape, np.float32))
+    if config.proposals and config.start != "zero":
+        with stage("proposals", 0.4):
+            proposal = propose(start, grey, camera, config.matching, config.rigid, config.fusion, config.evidence)
+    state = proposal.state
+    with stage("visibility", 0.9):
+        backward = backward_flow(state, start.backward_flow)
+        visible = project_visibility(state)
+        confidence = np.ones(grey.shape, np.float32)
+    if progress:
+        progress("done", 1.0)
+    moving = proposal.labels != 0 if proposal.motions else None
+    motion = proposal.motions[0].transform if proposal.motions and camera else None
+    return Solution(state, visible, confidence, moving, motion, start.state, backward, [], "start", seconds)

@@ -1,0 +1,104 @@
+"""Visibility by projection: what a state itself says of who hides whom at time 2.
+
+The forward-backward check of variational.terms.visibility asks two flow fields whether they agree, which needs both to be
+right where one of them cannot be. A state with disparities knows more: of all pixels of left1 that land on one pixel of
+left2 the nearest, that of largest disparity, is seen.
+"""
+
+import numpy as np
+
+from variational.jit import parallel, prange
+from variational.state import D1, C, U, V
+
+
+@parallel
+def _front(disparity: np.ndarray, u: np.ndarray, v: np.ndarray, front: np.ndarray) -> None:
+    """front (H, W): largest disparity landing on each pixel of left2 and its direct neighbours, -1 where none lands."""
+    height, width = disparity.shape
+    for band in prange(8):
+        first, last = band * height // 8, (band + 1) * height // 8
+        for y in range(height):
+            for x in range(width):
+                to_x, to_y = int(np.floor(x + u[y, x])), int(np.floor(y + v[y, x]))
+                for j in range(max(to_y, first), min(to_y + 2, last)):
+                    for i in range(max(to_x, 0), min(to_x + 2, width)):
+                        if disparity[y, x] > front[j, i]:
+                            front[j, i] = disparity[y, x]
+
+
+@parallel
+def _seen(disparity: np.ndarray, u: np.ndarray, v: np.ndarray, front: np.ndarray, margin: float, seen: np.ndarray) -> None:
+    height, width = disparity.shape
+    for y in prange(height):
+        for x in range(width):
+            to_x, to_y = int(np.rint(x + u[y, x])), int(np.rint(y + v[y, x]))
+            inside = 0 <= to_x < width and 0 <= to_y < height
+            seen[y, x] = inside and disparity[y, x] >= front[to_y, to_x] - margin
+
+
+def _front_of(state: np.ndarray) -> np.ndarray:
+    front = np.full(state.shape[1:], -1, np.float32)
+    _front(np.maximum(state[D1] + state[C], 0), state[U], state[V], front)
+    return front
+
+
+def project_visibility(state: np.ndarray, margin_px: float = 1.5) -> np.ndarray:
+    """Which pixels of left1 are seen in left2.
+
+    Parameters
+    ----------
+    state : np.ndarray
+        (5, H, W).
+    margin_px : float
+        A pixel is hidden where something nearer by more than this disparity lands on the same place.
+
+    Returns
+    -------
+    np.ndarray
+        (H, W) bool; False also where the pixel leaves the image.
+    """
+    seen = np.empty(state.shape[1:], bool)
+    disparity = np.maximum(state[D1] + state[C], 0)
+    _seen(disparity, state[U], state[V], _front_of(state), np.float32(margin_px), seen)
+    return seen
+
+
+@parallel
+def _backward(
+    disparity: np.ndarray, u: np.ndarray, v: np.ndarray, front: np.ndarray, margin: float, best: np.ndarray, backward: np.ndarray
+) -> None:
+    height, width = disparity.shape
+    for band in prange(8):
+        first, last = band * height // 8, (band + 1) * height // 8
+        for y in range(height):
+            for x in range(width):
+                at_x, at_y = x + u[y, x], y + v[y, x]
+                to_x, to_y = int(np.rint(at_x)), int(np.rint(at_y))
+                if first <= to_y < last and 0 <= to_x < width and disparity[y, x] >= front[to_y, to_x] - margin:
+                    distance = (at_x - to_x) ** 2 + (at_y - to_y) ** 2
+                    if distance < best[to_y, to_x]:
+                        best[to_y, to_x] = distance
+                        backward[to_y, to_x, 0] = -u[y, x]
+                        backward[to_y, to_x, 1] = -v[y, x]
+
+
+def backward_flow(state: np.ndarray, fallback: np.ndarray, margin_px: float = 1.5) -> np.ndarray:
+    """Flow from left2 to left1 that belongs to a state.
+
+    Parameters
+    ----------
+    state : np.ndarray
+        (5, H, W).
+    fallback : np.ndarray
+        (H, W, 2), taken where nothing seen lands.
+
+    Returns
+    -------
+    np.ndarray
+        (H, W, 2) float32, minus the flow of the visible pixel that lands nearest to each pixel's centre.
+    """
+    backward = fallback.astype(np.float32, copy=True)
+    best = np.full(state.shape[1:], np.inf, np.float32)
+    disparity = np.maximum(state[D1] + state[C], 0)
+    _backward(disparity, state[U], state[V], _front_of(state), np.float32(margin_px), best, backward)
+    return backward
