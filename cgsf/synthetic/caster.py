@@ -116,9 +116,10 @@ def cast(
         p00, p01, p02 = plane[n, 0, 0], plane[n, 0, 1], plane[n, 0, 2]
         p10, p11, p12 = plane[n, 1, 0], plane[n, 1, 1], plane[n, 1, 2]
         p20, p21, p22 = plane[n, 2, 0], plane[n, 2, 1], plane[n, 2, 2]
+        narrow = bounds[n, 1] - bounds[n, 0] < 6
         for row in range(bounds[n, 2], bounds[n, 3] + 1):
             first, last = bounds[n, 0], bounds[n, 1]
-            for i in range(3):  # columns of this row where b_i can be positive
+            for i in range(0 if narrow else 3):  # columns of this row where b_i can be positive
                 slope = plane[n, i, 0]
                 reach = plane[n, i, 1] * row + plane[n, i, 2] + 0.5 * abs(plane[n, i, 1])
                 if slope > 0.0:

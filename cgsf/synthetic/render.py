@@ -13,7 +13,7 @@ from cgsf.synthetic.caster import Caster
 from cgsf.synthetic.families import FAMILIES
 from cgsf.synthetic.scene import Scene, Soup
 from cgsf.synthetic.sensor import Sensor
-from cgsf.synthetic.shading import Illumination, Surfaces, shade_image
+from cgsf.synthetic.shading import ILLUMINATION, TEXTURE, Surfaces, shade_image
 from cgsf.synthetic.textures import TextureSource
 from cgsf.synthetic.truth import View, follow, seen
 
@@ -78,18 +78,20 @@ class Renderer:
         camera = scene.camera
         self.intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy], float)
         self.soup = Soup.of(scene)
-        self.no_culling = np.zeros(len(self.soup.points), bool)
         textures = self.soup.textures
         self.atlas = np.concatenate([texture.levels for texture in textures])
-        self.atlas_start = np.cumsum([0, *(len(texture.levels) for texture in textures[:-1])])
-        self.atlas_size = np.array([texture.size for texture in textures])
-        self.atlas_mirrored = np.array([texture.mirrored for texture in textures])
+        self.textures = np.zeros(len(textures), TEXTURE)
+        self.textures["start"] = np.cumsum([0, *(len(texture.levels) for texture in textures[:-1])])
+        self.textures["size"] = [texture.size for texture in textures]
+        self.textures["mirrored"] = [texture.mirrored for texture in textures]
         self.offsets = _QUARTERS if config.antialias else _QUARTERS[:0]
 
     def stereo(self, time: float) -> tuple[View, View, np.ndarray, np.ndarray]:
         """Left and right view at `time` with their radiance, (H, W, 3) float32 each."""
         points, normals = self.soup.at(self.scene, time)
-        light = self._illumination(points)
+        illumination, depth_map = self._illumination(points)
+        soup = self.soup
+        surfaces = Surfaces(points, normals, soup.uv, soup.material, soup.materials, self.textures, self.atlas)
         pose = self.scene.path.pose(time)
         views, radiances = [], []
         for shift in (0.0, self.scene.camera.baseline_m):
@@ -97,11 +99,9 @@ class Renderer:
             pose[0, 3] -= shift
             caster = Caster(points, pose, self.soup.culled, self.intrinsics, self.height, self.width)
             inverse_depth, hit = caster.centres()
-            surfaces = Surfaces(
-                caster.plane, points, normals, self.soup.uv, self.soup.surface, self.soup.material, self.soup.materials,
-                self.atlas, self.atlas_start, self.atlas_size, self.atlas_mirrored,
-            )  # fmt: skip
-            radiances.append(shade_image(surfaces, light, caster, inverse_depth, hit, self.offsets))
+            radiances.append(
+                shade_image(surfaces, soup.surface, illumination, depth_map, caster, inverse_depth, hit, self.offsets)
+            )
             views.append(View(caster, inverse_depth, hit))
         return views[0], views[1], radiances[0], radiances[1]
 
@@ -121,9 +121,10 @@ class Renderer:
                 right_radiance *= steps / (steps + 1)
         return left, right, left_radiance, right_radiance
 
-    def _illumination(self, points: np.ndarray) -> Illumination:
+    def _illumination(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The record of light and sky, and the shadow map, for `points` in the world."""
         light, sky = self.scene.light, self.scene.sky
-        size = max(16, round(1.6 * float(np.sqrt(self.height * self.width))))
+        size = max(16, round(1.4 * float(np.sqrt(self.height * self.width))))
         forward = light.target - light.position
         distance = float(np.linalg.norm(forward))
         forward = forward / distance
@@ -135,17 +136,21 @@ class Renderer:
         focal = 0.5 * size * distance / light.radius
         middle = 0.5 * (size - 1)
         if self.config.shadows:
-            caster = Caster(points, pose, self.no_culling, np.array([focal, focal, middle, middle]), size, size)
+            caster = Caster(points, pose, self.soup.culled, np.array([focal, focal, middle, middle]), size, size)
             inverse_depth, _ = caster.centres()
             with np.errstate(divide="ignore"):
                 depth = (1 / inverse_depth).astype(np.float32)
         else:
             depth = np.full((size, size), np.inf, np.float32)
-        bias = 2.0 * light.radius / size + 0.01
-        return Illumination(
-            light.position, light.color, light.falloff_m, light.above, light.below, sky.horizon, sky.zenith,
-            sky.cloud_strength, sky.haze_per_m, depth, pose, focal, bias, self.config.gloss,
-        )  # fmt: skip
+        record = np.zeros(1, ILLUMINATION)
+        for name in ("position", "color", "above", "below", "falloff_m"):
+            record[name] = getattr(light, name)
+        for name in ("horizon", "zenith", "cloud_strength", "haze_per_m"):
+            record[name] = getattr(sky, name)
+        record["shadow_pose"], record["shadow_focal"] = pose, focal
+        record["shadow_bias_m"] = 2.0 * light.radius / size + 0.01
+        record["gloss"] = self.config.gloss
+        return record, depth
 
 
 def truth_of(renderer: Renderer, left1: View, right1: View, left2: View, right2: View) -> Truth:

@@ -1,5 +1,6 @@
 """From radiance to the picture that a camera delivers: exposure, vignetting, blur, tone curve, noise, eight bits."""
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -73,7 +74,7 @@ class Sensor:
         gain = np.ones(3) if self.gain is None else self.gain[camera]
         factor = scale * gain * (1.0 if self.flicker is None else self.flicker[frame])
         image = np.empty_like(radiance)
-        _expose(radiance, factor, self.vignetting, self.gamma, self.grey, image)
+        _expose(radiance, factor, self.vignetting, np.linspace(0, 1, 1025) ** (2 * self.gamma), self.grey, image)
         if self.blur_px > 0.2:
             image = cv2.GaussianBlur(image, (5, 5), self.blur_px)
         if self.read_noise > 0 or self.shot_noise > 0:
@@ -86,8 +87,10 @@ class Sensor:
 
 
 @rowwise
-def _expose(radiance: np.ndarray, factor: np.ndarray, vignetting: float, gamma: float, grey: bool, out: np.ndarray) -> None:
+def _expose(radiance: np.ndarray, factor: np.ndarray, vignetting: float, curve: np.ndarray, grey: bool, out: np.ndarray) -> None:
+    """Gains, vignetting, clip and tone curve; `curve` (K,) is a table over the square root of the light."""
     height, width = radiance.shape[0], radiance.shape[1]
+    last = curve.size - 2
     for row in range(height):
         y = 2.0 * row / (height - 1) - 1.0
         for column in range(width):
@@ -96,9 +99,11 @@ def _expose(radiance: np.ndarray, factor: np.ndarray, vignetting: float, gamma: 
             b, g, r = radiance[row, column, 0] * factor[0], radiance[row, column, 1] * factor[1], radiance[row, column, 2] * factor[2]
             if grey:
                 b = g = r = 0.114 * b + 0.587 * g + 0.299 * r
-            out[row, column, 0] = min(max(b * light, 0.0), 1.0) ** gamma
-            out[row, column, 1] = min(max(g * light, 0.0), 1.0) ** gamma if not grey else out[row, column, 0]
-            out[row, column, 2] = min(max(r * light, 0.0), 1.0) ** gamma if not grey else out[row, column, 0]
+            for channel in range(3):
+                value = b if channel == 0 else (g if channel == 1 else r)
+                place = math.sqrt(min(max(value * light, 0.0), 1.0)) * (last + 1)
+                i = min(int(place), last)
+                out[row, column, channel] = curve[i] + (place - i) * (curve[i + 1] - curve[i])
 
 
 @lru_cache(maxsize=1)

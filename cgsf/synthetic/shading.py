@@ -17,39 +17,38 @@ from variational.jit import rowwise, scalar
 _SHARPNESS = 0.85
 
 
-class Surfaces(NamedTuple):
-    """What the shading of one image reads of the triangles; see `scene.Soup` and `caster.setup_triangles`."""
+#: Where a texture lies in the atlas, its pixels, whether it repeats mirrored.
+TEXTURE = np.dtype([("start", np.int64), ("size", np.int64), ("mirrored", np.bool_)], align=True)
 
-    plane: np.ndarray
+_VECTOR = (np.float64, (3,))
+#: Light and surroundings of one moment; see `scene.Light` and `scene.Sky`. Records, unlike tuples of arrays, cost kernels nothing.
+ILLUMINATION = np.dtype(
+    [
+        ("position", *_VECTOR), ("color", *_VECTOR), ("above", *_VECTOR), ("below", *_VECTOR), ("horizon", *_VECTOR),
+        ("zenith", *_VECTOR), ("falloff_m", np.float64), ("cloud_strength", np.float64), ("haze_per_m", np.float64),
+        ("shadow_pose", np.float64, (4, 4)), ("shadow_focal", np.float64), ("shadow_bias_m", np.float64), ("gloss", np.float64),
+    ],
+    align=True,
+)  # fmt: skip
+
+
+class Surfaces(NamedTuple):
+    """What the shading of an image reads of the triangles; see `scene.Soup`. Corners and normals are the world's."""
+
     corners: np.ndarray
     normals: np.ndarray
     uv: np.ndarray
-    surface: np.ndarray
     material: np.ndarray
     materials: np.ndarray
+    textures: np.ndarray
     atlas: np.ndarray
-    atlas_start: np.ndarray
-    atlas_size: np.ndarray
-    atlas_mirrored: np.ndarray
 
 
-class Illumination(NamedTuple):
-    """Light and surroundings; see `scene.Light` and `scene.Sky`."""
-
-    position: np.ndarray
-    color: np.ndarray
-    falloff_m: float
-    above: np.ndarray
-    below: np.ndarray
-    horizon: np.ndarray
-    zenith: np.ndarray
-    cloud_strength: float
-    haze_per_m: float
-    shadow_depth: np.ndarray
-    shadow_pose: np.ndarray
-    shadow_focal: float
-    shadow_bias_m: float
-    gloss: float
+@scalar
+def _texel(atlas: np.ndarray, place: int) -> int:
+    """The three channels of a texel, 21 bits apart, so that one multiplication weighs all of them."""
+    packed = np.int64(atlas[place])
+    return (packed & 0xFF) | ((packed & 0xFF00) << 13) | ((packed & 0xFF0000) << 26)
 
 
 @scalar
@@ -57,7 +56,6 @@ def _level(atlas: np.ndarray, start: int, size: int, mirrored: bool, u: float, v
     """Add `weight` times the bilinear value of one texture copy at (u, v) in repeats, pixel centres at halves."""
     x, y = u * size - 0.5, v * size - 0.5
     fx, fy = math.floor(x), math.floor(y)
-    ax, ay = x - fx, y - fy
     x0, y0 = int(fx), int(fy)
     x1, y1 = x0 + 1, y0 + 1
     if mirrored:
@@ -67,74 +65,77 @@ def _level(atlas: np.ndarray, start: int, size: int, mirrored: bool, u: float, v
         y0, y1 = min(y0, period - y0), min(y1, period - y1)
     else:
         x0, x1, y0, y1 = x0 & (size - 1), x1 & (size - 1), y0 & (size - 1), y1 & (size - 1)
-    p00, p01 = start + 3 * (y0 * size + x0), start + 3 * (y0 * size + x1)
-    p10, p11 = start + 3 * (y1 * size + x0), start + 3 * (y1 * size + x1)
-    w11 = ax * ay
-    w01, w10 = ax - w11, ay - w11
-    w00 = 1.0 - ax - w10
-    scale = weight / 255.0
-    for c in range(3):
-        out[c] += scale * (w00 * atlas[p00 + c] + w01 * atlas[p01 + c] + w10 * atlas[p10 + c] + w11 * atlas[p11 + c])
+    ax, ay = 4096.0 * (x - fx), y - fy
+    w11 = int(ax * ay)
+    w01, w10 = int(ax) - w11, int(4096.0 * ay) - w11
+    w00 = max(4096 - w01 - w10 - w11, 0)
+    upper, lower = start + y0 * size, start + y1 * size
+    total = w00 * _texel(atlas, upper + x0) + w01 * _texel(atlas, upper + x1)
+    total += w10 * _texel(atlas, lower + x0) + w11 * _texel(atlas, lower + x1)
+    scale = weight / (255.0 * 4096.0)
+    out[0] += scale * (total & 0x1FFFFF)
+    out[1] += scale * ((total >> 21) & 0x1FFFFF)
+    out[2] += scale * (total >> 42)
 
 
 @scalar
 def _texture(
-    atlas: np.ndarray, start: int, size: int, mirrored: bool, u: float, v: float, texels: float, weight: float, out: np.ndarray
-) -> None:
-    """Add `weight` times a texture's value; `texels` of the largest copy lie under the pixel, and choose the copies.
+    atlas: np.ndarray, start: int, size: int, mirrored: bool, u: float, v: float, texels: float, smooth: bool, weight: float,
+    out: np.ndarray,
+) -> None:  # fmt: skip
+    """Add `weight` times a texture's value; `texels` of the largest copy lie under the pixel, and choose the copy.
 
-    Between two copies the mix is linear in the texels, close to a logarithm's and much cheaper.
+    If `smooth`, two copies are mixed, linearly in the texels: close to a logarithm's mix and much cheaper.
     """
     while texels >= 2.0 and size > 1:
         texels *= 0.5
-        start += 3 * size * size
+        start += size * size
         size >>= 1
     mix = texels - 1.0
-    if mix < 0.15 or size == 1:
+    if size == 1 or mix < 0.2 or (not smooth and mix < 0.5):
         _level(atlas, start, size, mirrored, u, v, weight, out)
-    elif mix > 0.85:
-        _level(atlas, start + 3 * size * size, size >> 1, mirrored, u, v, weight, out)
+    elif mix > 0.8 or not smooth:
+        _level(atlas, start + size * size, size >> 1, mirrored, u, v, weight, out)
     else:
         _level(atlas, start, size, mirrored, u, v, weight * (1.0 - mix), out)
-        _level(atlas, start + 3 * size * size, size >> 1, mirrored, u, v, weight * mix, out)
+        _level(atlas, start + size * size, size >> 1, mirrored, u, v, weight * mix, out)
 
 
 @scalar
-def _sky(
-    atlas: np.ndarray, size: int, horizon: np.ndarray, zenith: np.ndarray, ground: np.ndarray, cloud_strength: float,
-    dx: float, dy: float, dz: float, out: np.ndarray,
-) -> None:  # fmt: skip
+def _sky(atlas: np.ndarray, size: int, illumination: np.ndarray, dx: float, dy: float, dz: float, out: np.ndarray) -> None:
     """Radiance (3,) from direction (dx, dy, dz), unit length, y down; the clouds are the atlas's first texture."""
+    light = illumination[0]
     if dy > 0.0:  # below the horizon: the ground's mean colour, for mirrors
         share = min(1.0, 3.0 * dy)
         for c in range(3):
-            out[c] = (1.0 - share) * horizon[c] + share * 0.35 * ground[c]
+            out[c] = (1.0 - share) * light.horizon[c] + share * 0.35 * light.below[c]
         return
     mix = min(1.0, 1.4 * math.sqrt(-dy))
     out[0] = out[1] = out[2] = 0.0
     reach = 0.25 / (0.12 - dy)
-    _texture(atlas, 0, size, True, dx * reach, dz * reach, 2.0 + 6.0 * (1.0 - mix), 1.0, out)
+    _texture(atlas, 0, size, True, dx * reach, dz * reach, 2.0 + 6.0 * (1.0 - mix), False, 1.0, out)
     for c in range(3):
-        cloud = 1.0 + cloud_strength * mix * (2.0 * out[c] - 1.0)
-        out[c] = ((1.0 - mix) * horizon[c] + mix * zenith[c]) * max(cloud, 0.05)
+        cloud = 1.0 + light.cloud_strength * mix * (2.0 * out[c] - 1.0)
+        out[c] = ((1.0 - mix) * light.horizon[c] + mix * light.zenith[c]) * max(cloud, 0.05)
 
 
 @scalar
-def _lit(depth: np.ndarray, pose: np.ndarray, focal: float, bias_m: float, px: float, py: float, pz: float) -> float:
+def _lit(depth: np.ndarray, illumination: np.ndarray, px: float, py: float, pz: float) -> float:
     """Share of the light's four nearest shadow-map rays that reach the world point."""
-    size = depth.shape[0]
+    light = illumination[0]
+    pose, size = light.shadow_pose, depth.shape[0]
     z = pose[2, 0] * px + pose[2, 1] * py + pose[2, 2] * pz + pose[2, 3]
     if z <= 0.0:
         return 1.0
     x = pose[0, 0] * px + pose[0, 1] * py + pose[0, 2] * pz + pose[0, 3]
     y = pose[1, 0] * px + pose[1, 1] * py + pose[1, 2] * pz + pose[1, 3]
     middle = 0.5 * (size - 1)
-    u, v = focal * x / z + middle, focal * y / z + middle
+    u, v = light.shadow_focal * x / z + middle, light.shadow_focal * y / z + middle
     if u < 0.0 or v < 0.0 or u >= size - 1 or v >= size - 1:
         return 1.0
     i, j = int(v), int(u)
     a, b = u - j, v - i
-    limit = z - bias_m
+    limit = z - light.shadow_bias_m
     top = (1.0 - a) * (depth[i, j] > limit) + a * (depth[i, j + 1] > limit)
     bottom = (1.0 - a) * (depth[i + 1, j] > limit) + a * (depth[i + 1, j + 1] > limit)
     return (1.0 - b) * top + b * bottom
@@ -170,13 +171,22 @@ def merge_rays(hit: np.ndarray, surface: np.ndarray, count: int, weight: np.ndar
 
 @rowwise
 def shade(
-    s: Surfaces, light: Illumination, pose: np.ndarray, intrinsics: np.ndarray, x_of: np.ndarray, y_of: np.ndarray,
-    hit: np.ndarray, weight: np.ndarray, image: np.ndarray,
+    corners: np.ndarray, normals: np.ndarray, uv: np.ndarray, material_of: np.ndarray, materials: np.ndarray,
+    textures: np.ndarray, atlas: np.ndarray, illumination: np.ndarray, depth_map: np.ndarray, plane: np.ndarray,
+    pose: np.ndarray, intrinsics: np.ndarray, x_of: np.ndarray, y_of: np.ndarray, hit: np.ndarray, weight: np.ndarray,
+    image: np.ndarray,
 ) -> None:  # fmt: skip
     """Add the radiance along rays to an image.
 
     Parameters
     ----------
+    corners, ..., atlas
+        `Surfaces`.
+    illumination : ndarray (1,) of ILLUMINATION
+    depth_map : ndarray (S, S) float32
+        Depth along the light's rays, metres.
+    plane : ndarray (N, 3, 3)
+        From `caster.setup_triangles` for this camera.
     pose : ndarray (4, 4)
         World to camera.
     intrinsics : ndarray (4,)
@@ -189,10 +199,7 @@ def shade(
         Their shares of the pixels that they fall in; rays of weight 0 are skipped.
     image : ndarray (H, W, 3) float32, written
     """
-    plane, corners, normals, uv, material_of, materials = s.plane, s.corners, s.normals, s.uv, s.material, s.materials
-    atlas, atlas_start, atlas_size, atlas_mirrored = s.atlas, s.atlas_start, s.atlas_size, s.atlas_mirrored
-    depth_map, depth_pose, horizon, zenith = light.shadow_depth, light.shadow_pose, light.horizon, light.zenith
-    above, below, sun = light.above, light.below, light.color
+    light = illumination[0]
     out, work, eye = np.empty(3), np.empty(3), np.empty(3)
     for i in range(3):
         eye[i] = -(pose[0, i] * pose[0, 3] + pose[1, i] * pose[1, 3] + pose[2, i] * pose[2, 3])
@@ -207,7 +214,7 @@ def shade(
             dx = (pose[0, 0] * rx + pose[1, 0] * ry + pose[2, 0]) * scale
             dy = (pose[0, 1] * rx + pose[1, 1] * ry + pose[2, 1]) * scale
             dz = (pose[0, 2] * rx + pose[1, 2] * ry + pose[2, 2]) * scale
-            _sky(atlas, atlas_size[0], horizon, zenith, below, light.cloud_strength, dx, dy, dz, out)
+            _sky(atlas, textures[0].size, illumination, dx, dy, dz, out)
             for channel in range(3):
                 image[row, column, channel] += share * out[channel]
             continue
@@ -244,30 +251,30 @@ def shade(
         major, minor = max(across, down), min(across, down)
 
         material = materials[material_of[n]]
-        index = material.texture
+        texture = textures[material.texture]
         a = material.uv
         tu, tv = a[0, 0] * u + a[0, 1] * v + a[0, 2], a[1, 0] * u + a[1, 1] * v + a[1, 2]
         stretch = math.sqrt(a[0, 0] * a[0, 0] + a[1, 0] * a[1, 0])
         taps = 1 if major < 1.6 * minor else (2 if major < 4.0 * minor else 4)
-        texels = _SHARPNESS * max(major / taps, minor) * stretch * atlas_size[index]
+        texels = _SHARPNESS * max(major / taps, minor) * stretch * texture.size
         du, dv = (ux, vx) if across >= down else (uy, vy)
         step_u, step_v = a[0, 0] * du + a[0, 1] * dv, a[1, 0] * du + a[1, 1] * dv
         work[0] = work[1] = work[2] = 0.0
         for tap in range(taps):
             along = (tap + 0.5) / taps - 0.5
             _texture(
-                atlas, atlas_start[index], atlas_size[index], atlas_mirrored[index],
-                tu + along * step_u, tv + along * step_v, texels, 1.0 / taps, work,
+                atlas, texture.start, texture.size, texture.mirrored,
+                tu + along * step_u, tv + along * step_v, texels, taps == 1, 1.0 / taps, work,
             )  # fmt: skip
         blue, green, red = work[0], work[1], work[2]
         grain = 1.0
         if material.detail_strength > 0.0:
-            index, fine = material.detail, material.detail_scale
-            texels = _SHARPNESS * math.sqrt(major * minor) * fine * atlas_size[index]
+            texture, fine = textures[material.detail], material.detail_scale
+            texels = _SHARPNESS * math.sqrt(major * minor) * fine * texture.size
             fade = min(1.0, 2.0 - texels / 64.0)  # far away the fine texture is below the pixel
             if fade > 0.0:
                 work[0] = work[1] = work[2] = 0.0
-                _texture(atlas, atlas_start[index], atlas_size[index], atlas_mirrored[index], u * fine, v * fine, texels, 1.0, work)
+                _texture(atlas, texture.start, texture.size, texture.mirrored, u * fine, v * fine, texels, True, 1.0, work)
                 grain = max(1.0 + fade * material.detail_strength * (2.0 * work[1] - 1.0), 0.0)
 
         # light
@@ -277,9 +284,7 @@ def shade(
         cosine = nx * lx + ny * ly + nz * lz
         direct, highlight = 0.0, 0.0
         if cosine > 0.0:
-            lit = _lit(
-                depth_map, depth_pose, light.shadow_focal, light.shadow_bias_m, px + 0.02 * nx, py + 0.02 * ny, pz + 0.02 * nz
-            )
+            lit = _lit(depth_map, illumination, px + 0.02 * nx, py + 0.02 * ny, pz + 0.02 * nz)
             lit /= 1.0 + (reach / light.falloff_m) ** 2
             direct = lit * cosine
             strength = material.specular * light.gloss
@@ -294,27 +299,33 @@ def shade(
         for channel in range(3):
             albedo = bgr[channel, 0] * blue + bgr[channel, 1] * green + bgr[channel, 2] * red + bgr[channel, 3]
             albedo = min(max(albedo, 0.0), 1.0) * grain
-            ambient = up * above[channel] + (1.0 - up) * below[channel]
-            out[channel] = albedo * albedo * (ambient + sun[channel] * direct + 2.0 * material.glow) + highlight * sun[channel]
+            ambient = up * light.above[channel] + (1.0 - up) * light.below[channel]
+            sun = light.color[channel]
+            out[channel] = albedo * albedo * (ambient + sun * direct + 2.0 * material.glow) + highlight * sun
         mirror = material.mirror * light.gloss
         if mirror > 0.0:
             mirror *= 0.15 + 0.85 * (1.0 - facing) ** 3
             dx, dy, dz = 2 * facing * nx - ex, 2 * facing * ny - ey, 2 * facing * nz - ez
-            _sky(atlas, atlas_size[0], horizon, zenith, below, light.cloud_strength, dx, dy, dz, work)
+            _sky(atlas, textures[0].size, illumination, dx, dy, dz, work)
             for channel in range(3):
                 out[channel] = (1.0 - mirror) * out[channel] + mirror * work[channel]
         clear = math.exp(-light.haze_per_m * distance) if light.haze_per_m > 0.0 else 1.0
         for channel in range(3):
-            image[row, column, channel] += share * (clear * out[channel] + (1.0 - clear) * horizon[channel])
+            image[row, column, channel] += share * (clear * out[channel] + (1.0 - clear) * light.horizon[channel])
 
 
 def shade_image(
-    s: Surfaces, light: Illumination, caster: Caster, inverse_depth: np.ndarray, hit: np.ndarray, offsets: np.ndarray
-) -> np.ndarray:
+    surfaces: Surfaces, surface: np.ndarray, illumination: np.ndarray, depth_map: np.ndarray, caster: Caster,
+    inverse_depth: np.ndarray, hit: np.ndarray, offsets: np.ndarray,
+) -> np.ndarray:  # fmt: skip
     """Radiance (H, W, 3) float32 of an image.
 
     Parameters
     ----------
+    surfaces, illumination, depth_map
+        As in `shade`.
+    surface : ndarray (N,)
+        Smooth surface that each triangle belongs to.
     caster : Caster
         The camera.
     inverse_depth, hit : ndarray (H, W)
@@ -324,15 +335,16 @@ def shade_image(
     """
     edge = np.zeros(hit.shape, bool)
     if len(offsets):
-        find_edges(hit, inverse_depth, s.surface, edge)
+        find_edges(hit, inverse_depth, surface, edge)
     image = np.zeros((*hit.shape, 3), np.float32)
-    pixels = np.flatnonzero(edge)
     inside = (~edge).ravel().astype(np.float32)
     y, x = np.divmod(np.arange(hit.size, dtype=np.int32), np.int32(hit.shape[1]))
-    shade(s, light, caster.pose, caster.intrinsics, x.astype(float), y.astype(float), hit.ravel(), inside, image)
+    camera = (caster.plane, caster.pose, caster.intrinsics)
+    shade(*surfaces, illumination, depth_map, *camera, x.astype(float), y.astype(float), hit.ravel(), inside, image)
+    pixels = np.flatnonzero(edge)
     if len(pixels):
         x, y, hit = caster.within(pixels, offsets)
         weight = np.empty(hit.size, np.float32)
-        merge_rays(hit, s.surface, len(offsets), weight)
-        shade(s, light, caster.pose, caster.intrinsics, x, y, hit, weight, image)
+        merge_rays(hit, surface, len(offsets), weight)
+        shade(*surfaces, illumination, depth_map, *camera, x, y, hit, weight, image)
     return image

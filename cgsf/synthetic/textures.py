@@ -21,7 +21,7 @@ SIZE = 256
 #: Pixels of a photograph after it has been read.
 PHOTO_SIZE = 512
 #: Variants of each kind, and photographs, that one scene chooses from.
-VARIANTS_PER_SCENE, PHOTOS_PER_SCENE = 3, 8
+VARIANTS_PER_SCENE, PHOTOS_PER_SCENE = 3, 6
 _SEED = 20_190_512
 
 
@@ -31,8 +31,8 @@ class Texture:
 
     Parameters
     ----------
-    levels : ndarray (K,) uint8
-        All copies one after the other, BGR, row by row, the largest first.
+    levels : ndarray (K,) uint32
+        All copies one after the other, row by row, the largest first; a texel is ``b + 256 g + 65536 r``.
     size : int
         Pixels of the largest copy, a power of two.
     mirrored : bool
@@ -51,7 +51,8 @@ class Texture:
         while copies[-1].shape[0] > 1:
             half = copies[-1].shape[0] // 2
             copies.append(cv2.resize(copies[-1], (half, half), interpolation=cv2.INTER_AREA).reshape(half, half, 3))
-        return cls(np.concatenate([copy.ravel() for copy in copies]), size, mirrored)
+        texels = np.concatenate([copy.reshape(-1, 3) for copy in copies]).astype(np.uint32)
+        return cls(texels[:, 0] | texels[:, 1] << 8 | texels[:, 2] << 16, size, mirrored)
 
 
 @lru_cache(maxsize=None)
