@@ -2,9 +2,9 @@
 
 Candidates are whole motion fields, measured flow or rigid proposals. A candidate's cost at a pixel is how badly the
 census words of left1 agree with those of left2 and right2 where it leads, averaged over a small window; one that leads
-out of the image costs a constant. Neighbours pay for a difference of motion, less across jumps of disparity and edges of
-the image. The labelling minimises this along a tree at every pixel (rows first, then the column through it: the "simple
-tree" of Bleyer and Gelautz 2008), which dynamic programming does exactly in four sweeps.
+out of the image costs a constant. Neighbours pay for a difference of motion, less across jumps of disparity and edges
+of the image. The labelling minimises this along a tree at every pixel (rows first, then the column through it: the
+"simple tree" of Bleyer and Gelautz 2008), which dynamic programming does exactly in four sweeps.
 """
 
 from dataclasses import dataclass
@@ -54,8 +54,8 @@ class FusionConfig:
 
 @parallel
 def _costs(
-    candidates: np.ndarray, disparity: np.ndarray, words_left1: np.ndarray, words_left2: np.ndarray, words_right2: np.ndarray,
-    largest: float, outside: float, costs: np.ndarray,
+    candidates: np.ndarray, disparity: np.ndarray, words_left1: np.ndarray, words_left2: np.ndarray,
+    words_right2: np.ndarray, largest: float, outside: float, costs: np.ndarray,
 ) -> None:  # fmt: skip
     count, _, height, width = candidates.shape
     for y in prange(height):
@@ -81,7 +81,9 @@ def _costs(
 
 
 @parallel
-def _chains(candidates: np.ndarray, costs: np.ndarray, price: np.ndarray, inverse_scale: float, out: np.ndarray) -> None:
+def _chains(
+    candidates: np.ndarray, costs: np.ndarray, price: np.ndarray, inverse_scale: float, out: np.ndarray
+) -> None:
     """out (K, H, W): for every label of every pixel, the least cost of its whole row that has this label there.
 
     price[y, x] is paid for a full difference of motion between (x - 1, y) and (x, y).
@@ -130,8 +132,9 @@ def _price(disparity: np.ndarray, grey: np.ndarray, axis: int, config: FusionCon
 
 
 def motion_costs(
-    candidates: np.ndarray, disparity: np.ndarray, words: tuple[np.ndarray, np.ndarray, np.ndarray], config: FusionConfig
-) -> np.ndarray:
+    candidates: np.ndarray, disparity: np.ndarray, words: tuple[np.ndarray, np.ndarray, np.ndarray],
+    config: FusionConfig,
+) -> np.ndarray:  # fmt: skip
     """Cost in [0, 1] of each candidate at each pixel.
 
     Parameters

@@ -38,7 +38,7 @@ class MatchingConfig:
     Parameters
     ----------
     max_disparity : int
-        Largest disparity searched, in pixels; 0 finds it by a search over a third of the width at a quarter of the size.
+        Largest disparity searched, in pixels; 0 finds it by searching a third of the width at a quarter of the size.
     small_step, large_step : int
         Penalties for a change of disparity by one pixel and by more, in census bits; raising them smooths.
     edge_contrast : float
@@ -70,7 +70,7 @@ class StereoMatch:
     disparity : np.ndarray
         (H, W) float32, pixels, every pixel filled.
     matched : np.ndarray
-        (H, W) bool, True where the match is unique and agrees with the right image's; elsewhere `disparity` is filled in.
+        (H, W) bool, True where the match is unique and agrees with the right image's; `disparity` is filled elsewhere.
     words_left, words_right : np.ndarray
         (2, H, W) uint64 census words of the two images, for whoever compares them again.
     max_disparity : int
@@ -99,7 +99,8 @@ def _sub16(typing_context, a, b):  # type: ignore[no-untyped-def]
 @intrinsic
 def _min16(typing_context, a, b):  # type: ignore[no-untyped-def]
     """16-bit minimum."""
-    return types.int16(types.int16, types.int16), lambda c, builder, s, v: builder.select(builder.icmp_signed("<", *v), *v)
+    signature = types.int16(types.int16, types.int16)
+    return signature, lambda c, builder, s, v: builder.select(builder.icmp_signed("<", *v), *v)
 
 
 @intrinsic
@@ -159,7 +160,9 @@ def _matching_costs(left: np.ndarray, right_mirrored: np.ndarray, costs: np.ndar
 
 
 @rowwise
-def _step(cost: np.ndarray, before: np.ndarray, before_best: int, small: int, large: int, out: np.ndarray, total: np.ndarray) -> int:
+def _step(
+    cost: np.ndarray, before: np.ndarray, before_best: int, small: int, large: int, out: np.ndarray, total: np.ndarray
+) -> np.int16:
     """One pixel of one path: out = cost + min(same, neighbours + P1, best + P2) - best; returns the new best."""
     jump = _add16(before_best, large)
     best = np.int16(UNREACHABLE)
@@ -173,7 +176,7 @@ def _step(cost: np.ndarray, before: np.ndarray, before_best: int, small: int, la
 
 
 @rowwise
-def _start(cost: np.ndarray, out: np.ndarray, total: np.ndarray) -> int:
+def _start(cost: np.ndarray, out: np.ndarray, total: np.ndarray) -> np.int16:
     """A path's first pixel: its cost alone."""
     best = np.int16(UNREACHABLE)
     for d in range(cost.shape[0]):
@@ -218,14 +221,13 @@ def _aggregate(costs: np.ndarray, large_x: np.ndarray, large_y: np.ndarray, smal
                     if i == 0 or from_x < 0 or from_x >= width:
                         best[now, r, x] = _start(cost[x], paths[now, r, x], row)
                     else:
-                        best[now, r, x] = _step(
-                            cost[x], paths[before, r, from_x], best[before, r, from_x], small, large, paths[now, r, x], row
-                        )
+                        come_from, least = paths[before, r, from_x], best[before, r, from_x]
+                        best[now, r, x] = _step(cost[x], come_from, least, small, large, paths[now, r, x], row)
 
 
 @parallel
 def _select(totals: np.ndarray, disparity: np.ndarray, second_view: np.ndarray, margin: np.ndarray) -> None:
-    """Smallest sum with a parabola fit; for the right view the smallest along each of its pixels' diagonal (-1: none)."""
+    """Smallest sum with a parabola fit; for the right view the smallest along each pixel's diagonal (-1: none)."""
     _, height, width, disparities = totals.shape
     for y in prange(height):
         right_best = np.full(width, np.int16(32767), np.int16)
@@ -321,8 +323,8 @@ def stereo_costs(words_left: np.ndarray, words_right: np.ndarray, disparities: i
 def fill_background(disparity: np.ndarray, known: np.ndarray) -> np.ndarray:
     """Unknown pixels take the smaller of the nearest known disparities to the left and right in their row.
 
-    What a left image's pixel hides from the right camera lies behind its neighbour: the background continues. A row that
-    knows nothing takes the nearest row that does; where nothing is known at all, the result is zero.
+    What a left image's pixel hides from the right camera lies behind its neighbour: the background continues. A row
+    that knows nothing takes the nearest row that does; where nothing is known at all, the result is zero.
     """
     height, width = disparity.shape
     if not known.any():
@@ -339,12 +341,13 @@ def fill_background(disparity: np.ndarray, known: np.ndarray) -> np.ndarray:
 
 
 def find_max_disparity(left: np.ndarray, right: np.ndarray, config: MatchingConfig) -> int:
-    """Range to search at full size, in pixels: a margin above the largest disparity of a search at a quarter of the size."""
+    """Range to search at full size, pixels: a margin above the largest disparity found at a quarter of the size."""
     height, width = left.shape
-    small = (max(1, width // 4), max(1, height // 4))
-    words = [census(cv2.resize(image, small, interpolation=cv2.INTER_AREA)) for image in (left, right)]
-    searched = max(2, small[0] // 3)
-    disparity, matched = aggregate(stereo_costs(*words, searched), cv2.resize(left, small, interpolation=cv2.INTER_AREA), config)
+    size = (max(1, width // 4), max(1, height // 4))
+    small = [cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (left, right)]
+    searched = max(2, size[0] // 3)
+    costs = stereo_costs(census(small[0]), census(small[1]), searched)
+    disparity, matched = aggregate(costs, small[0], config)
     found = np.percentile(disparity[matched], 99.8) if matched.any() else searched / 2
     return int(min(width - 1, 16 * np.ceil((4 * found + 8) / 16)))
 

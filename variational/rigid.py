@@ -5,8 +5,8 @@ rigid motion of what surrounds them is all there is. A motion T acts on (x, y, d
 ``P T P^-1``, P being the camera's projection (Demirdjian and Darrell 2001). Fits are robust: three-point RANSAC on the
 image motion, then iteratively re-weighted Gauss-Newton on image motion and disparity together.
 
-Without a calibration the principal point is taken at the image's centre, and the focal length is the one, of a few, under
-which the correspondences move most rigidly; the baseline is arbitrary, it only scales the translation.
+Without a calibration the principal point is taken at the image's centre, and the focal length is the one, of a few,
+under which the correspondences move most rigidly; the baseline is arbitrary, it only scales the translation.
 """
 
 import logging
@@ -131,7 +131,7 @@ def fit_motion(first: np.ndarray, second: np.ndarray, projection: np.ndarray, it
         (4, 4) rigid transform; None where no three points agree with others or the points do not fix a motion.
     """
     points = _project(first, np.linalg.inv(projection))
-    camera_matrix = np.array([[projection[0, 0], 0, projection[0, 2]], [0, projection[1, 1], projection[1, 2]], [0, 0, 1]])
+    camera_matrix = np.vstack([projection[:2, :3], [0, 0, 1]])
     try:
         found, rotation, translation, inliers = cv2.solvePnPRansac(
             points, np.ascontiguousarray(second[:, :2]), camera_matrix, None,
@@ -147,8 +147,9 @@ def fit_motion(first: np.ndarray, second: np.ndarray, projection: np.ndarray, it
 
 
 def _gauss_newton(
-    transform: np.ndarray, points: np.ndarray, second: np.ndarray, projection: np.ndarray, iterations: int, scale_px: float = 0.7
-) -> np.ndarray | None:
+    transform: np.ndarray, points: np.ndarray, second: np.ndarray, projection: np.ndarray, iterations: int,
+    scale_px: float = 0.7,
+) -> np.ndarray | None:  # fmt: skip
     """Minimise the Geman-McClure penalty of the distance in (x, y, disparity) over a twist from the left."""
     fx, fy, fb = projection[0, 0], projection[1, 1], projection[2, 3]
     for _ in range(iterations):
@@ -190,7 +191,8 @@ def _thin(valid: np.ndarray, count: int) -> np.ndarray:
 def guess_camera(matches: Correspondences, config: RigidConfig) -> StereoCamera:
     """A camera to fit rigid motions with where none is known; see the module's text."""
     height, width = matches.valid.shape
-    candidates = [StereoCamera(f * width, f * width, (width - 1) / 2, (height - 1) / 2, 0.1) for f in (0.7, 1.0, 1.4, 2.0)]
+    centre = (width - 1) / 2, (height - 1) / 2
+    candidates = [StereoCamera(focal * width, focal * width, *centre, 0.1) for focal in (0.7, 1.0, 1.4, 2.0)]
     chosen = _thin(matches.valid & (matches.first[..., 2] > 0.5), config.points)
     if len(chosen) < config.min_points:
         return candidates[1]
@@ -242,11 +244,9 @@ def find_motions(matches: Correspondences, camera: StereoCamera, config: RigidCo
         if transform is None:
             return None
         homography = _homography(transform, camera)
-        support = np.zeros(region.size, bool)
-        indices = np.flatnonzero(left)
-        distance = np.linalg.norm(_apply(homography, first[indices]) - second[indices], axis=1)
-        support[indices] = distance < config.tolerance_px
-        support = support.reshape(region.shape)
+        support = np.zeros(region.shape, bool)
+        distance = np.linalg.norm(_apply(homography, first[left.ravel()]) - second[left.ravel()], axis=1)
+        support[left] = distance < config.tolerance_px
         if np.count_nonzero(support & region) < share * np.count_nonzero(region):
             return None
         return RigidMotion(transform, homography, support)

@@ -1,8 +1,8 @@
 """Visibility by projection: what a state itself says of who hides whom at time 2.
 
-The forward-backward check of variational.terms.visibility asks two flow fields whether they agree, which needs both to be
-right where one of them cannot be. A state with disparities knows more: of all pixels of left1 that land on one pixel of
-left2 the nearest, that of largest disparity, is seen.
+The forward-backward check of variational.terms.visibility asks two flow fields whether they agree, which needs both to
+be right where one of them cannot be. A state with disparities knows more: of all pixels of left1 that land on one pixel
+of left2 the nearest, that of largest disparity, is seen.
 """
 
 import numpy as np
@@ -27,7 +27,9 @@ def _front(disparity: np.ndarray, u: np.ndarray, v: np.ndarray, front: np.ndarra
 
 
 @parallel
-def _seen(disparity: np.ndarray, u: np.ndarray, v: np.ndarray, front: np.ndarray, margin: float, seen: np.ndarray) -> None:
+def _seen(
+    disparity: np.ndarray, u: np.ndarray, v: np.ndarray, front: np.ndarray, margin: float, seen: np.ndarray
+) -> None:
     height, width = disparity.shape
     for y in prange(height):
         for x in range(width):
@@ -65,8 +67,9 @@ def project_visibility(state: np.ndarray, margin_px: float = 1.5) -> np.ndarray:
 
 @parallel
 def _backward(
-    disparity: np.ndarray, u: np.ndarray, v: np.ndarray, front: np.ndarray, margin: float, best: np.ndarray, backward: np.ndarray
-) -> None:
+    disparity: np.ndarray, u: np.ndarray, v: np.ndarray, front: np.ndarray, margin: float, best: np.ndarray,
+    backward: np.ndarray,
+) -> None:  # fmt: skip
     height, width = disparity.shape
     for band in prange(8):
         first, last = band * height // 8, (band + 1) * height // 8
