@@ -1,0 +1,385 @@
+"""GA-Net: disparity by a concatenation or correlation volume, guided aggregation and soft-argmin.
+
+Zhang, Prisacariu, Yang, Torr: GA-Net, CVPR 2019 (arXiv:1904.06587), the deep model. Stacked U-Nets, hourglasses and
+aggregation blocks are loops over the configuration. Weights of the authors load through ``learned.checkpoint``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import prod
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from learned.correlation import disparity_correlation
+from learned.guided_aggregation import local_aggregation, semi_global_aggregation
+
+
+@dataclass(frozen=True)
+class GANetConfig:
+    """Sizes of a GA-Net; the defaults are the published deep model."""
+
+    max_disparity: int = 192
+    """Largest disparity in pixels; a multiple of the volume's reduction."""
+    stem: tuple[tuple[int, int, int], ...] = ((32, 3, 1), (32, 5, 3), (32, 3, 1))
+    """(channels, kernel, stride) of the first convolutions; the product of the strides is the volume's reduction."""
+    features: tuple[int, ...] = (48, 64, 96, 128)
+    """Channels of the feature U-Nets, each at half the resolution of the one before; the stem's are the top."""
+    unets: int = 2
+    """Stacked feature U-Nets."""
+    correlation_groups: int = 0
+    """0: the volume concatenates the features of both images; otherwise their cosine in this many groups of channels."""
+    volume: tuple[int, ...] = (32, 48, 64)
+    """Channels of the 3D hourglasses, each level at half the resolution."""
+    hourglasses: int = 2
+    """Stacked 3D hourglasses; each has a disparity head, and one more comes before the first."""
+    aggregated_levels: tuple[int, ...] = (0, 1)
+    """Hourglass levels with semi-global aggregation blocks (never the coarsest)."""
+    guidance_stem: int = 16
+    """Channels of the guidance subnet's full-resolution layers."""
+    full_resolution_head: bool = True
+    """Softmin and local aggregation on the upsampled volume, guided at full resolution. If False, both happen at the
+    volume's resolution and the disparity is upsampled by learned convex weights: a hundredth of the time."""
+
+    def __post_init__(self) -> None:
+        step = self.reduction * 2 ** (len(self.volume) - 1)
+        if self.max_disparity < step or self.max_disparity % step:
+            raise ValueError(f"max_disparity must be a positive multiple of {step}, not {self.max_disparity}")
+        if self.correlation_groups and self.stem[-1][0] % self.correlation_groups:
+            raise ValueError(f"correlation_groups must divide the {self.stem[-1][0]} feature channels")
+
+    @property
+    def reduction(self) -> int:
+        """Image pixels per pixel of the volume."""
+        return prod(stride for _, _, stride in self.stem)
+
+    @property
+    def cells(self) -> int:
+        """Sides of an image must be multiples of this; ``GANet`` pads them."""
+        return self.reduction * 2 ** max(len(self.features), len(self.volume) - 1)
+
+    @property
+    def blocks(self) -> dict[int, int]:
+        """Semi-global aggregation blocks on every aggregated level: two an hourglass, at the top one before the first."""
+        return {level: 2 * self.hourglasses if level else self.hourglasses + 1 for level in self.aggregated_levels}
+
+
+#: For a CPU: a correlation volume at 1/8, one hourglass, aggregation at its top level, learned upsampling.
+COMPACT = GANetConfig(stem=((16, 3, 2), (32, 3, 2), (48, 3, 2), (48, 3, 1)), features=(64, 96), unets=1,
+                      correlation_groups=16, volume=(32, 48, 64), hourglasses=1, aggregated_levels=(0,),
+                      full_resolution_head=False)
+
+
+class GANet(nn.Module):
+    """Disparity of the left image.
+
+    Images are (B, 3, H, W), of any size: they are padded at the top and on the right by repeating the border, and the
+    result is cropped back. Whoever loads the authors' weights passes images normalised as they were
+    (:func:`normalise`); the network itself applies no normalisation.
+    """
+
+    def __init__(self, config: GANetConfig | None = None) -> None:
+        super().__init__()
+        self.config = config = config or GANetConfig()
+        top = config.stem[-1][0]
+        self.features = _Features(config)
+        self.to_left, self.to_right = _convolution(top, top), _convolution(top, top)
+        self.guidance = _Guidance(config)
+        self.aggregation = _Aggregation(config)
+        for module in self.modules():
+            if isinstance(module, nn.Conv2d | nn.Conv3d):
+                nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
+
+    def forward(self, left: Tensor, right: Tensor) -> Tensor:
+        """Disparity (B, H, W) in pixels, float32: left(x, y) matches right(x - disparity, y)."""
+        height, width = left.shape[-2:]
+        return self.estimate(self._pad(left), self._pad(right))[-1][:, -height:, :width]
+
+    def estimate(self, left: Tensor, right: Tensor) -> list[Tensor]:
+        """Disparity (B, H, W) of every head in training, of the last one only in evaluation.
+
+        The sides must be multiples of ``config.cells``.
+        """
+        if left.shape[-2] % self.config.cells or left.shape[-1] % self.config.cells:
+            raise ValueError(f"image sides must be multiples of {self.config.cells}, not {tuple(left.shape[-2:])}")
+        if self.training:  # as the authors do: batch statistics do not mix left and right
+            left_features, right_features = self.features(left), self.features(right)
+        else:
+            left_features, right_features = self.features(torch.cat([left, right])).chunk(2)
+        volume = self._volume(self.to_left(left_features), self.to_right(right_features))
+        return self.aggregation(volume, self.guidance(left, left_features))
+
+    def _volume(self, left: Tensor, right: Tensor) -> Tensor:
+        disparities = self.config.max_disparity // self.config.reduction + 1
+        if self.config.correlation_groups:
+            return disparity_correlation(left, right, disparities, self.config.correlation_groups)
+        return concatenation_volume(left, right, disparities)
+
+    def _pad(self, image: Tensor) -> Tensor:
+        top, right = (-side % self.config.cells for side in image.shape[-2:])
+        return F.pad(image, (0, right, top, 0), mode="replicate") if top or right else image
+
+
+def normalise(image: Tensor) -> Tensor:
+    """Zero mean and unit deviation for each image and channel: what the authors feed their network (B, C, H, W)."""
+    deviation, mean = torch.std_mean(image, dim=(-2, -1), correction=0, keepdim=True)
+    return (image - mean) / deviation.clamp(min=1e-6)
+
+
+def concatenation_volume(left: Tensor, right: Tensor, disparities: int) -> Tensor:
+    """(B, 2 C, D, H, W): left features over the right ones moved by each disparity, zero where x < disparity."""
+    batch, channels, height, width = left.shape
+    channels_last = left.is_contiguous(memory_format=torch.channels_last)
+    layout = torch.channels_last_3d if channels_last else torch.contiguous_format
+    volume = torch.empty((batch, 2 * channels, disparities, height, width), dtype=left.dtype, device=left.device,
+                         memory_format=layout)
+    for d in range(disparities):
+        volume[:, :, d, :, : min(d, width)] = 0
+        if d < width:
+            volume[:, :channels, d, :, d:] = left[..., d:]
+            volume[:, channels:, d, :, d:] = right[..., : width - d]
+    return volume
+
+
+class _Features(nn.Module):
+    """Stem and stacked U-Nets; every skip connection of a U-Net is updated on the way down and up for the next one."""
+
+    def __init__(self, config: GANetConfig) -> None:
+        super().__init__()
+        stem, previous = [], 3
+        for channels, kernel, stride in config.stem:
+            stem.append(_convolution(previous, channels, kernel, stride))
+            previous = channels
+        self.stem = nn.Sequential(*stem)
+        widths = (previous, *config.features)
+        self.down, self.up = nn.ModuleList(), nn.ModuleList()
+        for unet in range(config.unets):
+            pairs = list(zip(widths, widths[1:], strict=False))
+            self.down.append(nn.ModuleList(_convolution(a, b, 3, 2) if unet == 0 else _Join(a, b) for a, b in pairs))
+            self.up.append(nn.ModuleList(_Join(b, a, up=True) for a, b in reversed(pairs)))
+
+    def forward(self, image: Tensor) -> Tensor:
+        x = self.stem(image)
+        skips = [x]
+        for unet, (down, up) in enumerate(zip(self.down, self.up, strict=True)):
+            for level, layer in enumerate(down, start=1):
+                if unet == 0:
+                    x = layer(x)
+                    skips.append(x)
+                else:
+                    x = skips[level] = layer(x, skips[level])
+            for level, layer in zip(range(len(up) - 1, -1, -1), up, strict=True):
+                x = skips[level] = layer(x, skips[level])
+        return x
+
+
+class _Guidance(nn.Module):
+    """From the left image and its features to the weights of every aggregation layer.
+
+    Returns, for each hourglass level, the guidance of its blocks in the order of use, and then the head's: the weights of
+    two local aggregations, or of one and of the convex upsampling.
+    """
+
+    def __init__(self, config: GANetConfig) -> None:
+        super().__init__()
+        self.config = config
+        top, stem = config.stem[-1][0], config.guidance_stem
+        if config.full_resolution_head:
+            self.image = nn.Sequential(_convolution(3, stem), _convolution(stem, 2 * stem))
+            self.feature = nn.Conv2d(top, top, 3, padding=1, bias=False)
+            self.feature_norm = nn.BatchNorm2d(top)
+            self.join = _convolution(2 * stem + top, stem)
+            reduce = (_convolution(stem, top, 5, config.reduction), _convolution(top, top))
+            self.head = nn.ModuleList(nn.Sequential(_convolution(stem, stem), _weights(stem, 75)) for _ in range(2))
+        else:
+            reduce = (_convolution(top, top), _convolution(top, top))
+            outputs = (75, 9 * config.reduction**2)
+            self.head = nn.ModuleList(nn.Sequential(_convolution(top, top), _weights(top, n)) for n in outputs)
+        self.steps, self.weights = nn.ModuleList(), nn.ModuleList()
+        previous = top
+        for level in range(max(config.aggregated_levels, default=-1) + 1):
+            # as wide as the volume it guides
+            width = top if level == 0 else config.volume[level]
+            steps = [nn.Sequential(*reduce) if level == 0 else
+                     nn.Sequential(_convolution(previous, width, 3, 2), _convolution(width, width))]
+            count = config.blocks.get(level, 0)
+            steps += [_convolution(width, width) for _ in range(count - 1)]
+            self.steps.append(nn.ModuleList(steps))
+            self.weights.append(nn.ModuleList(_weights(width, 20 * config.volume[level]) for _ in range(count)))
+            previous = width
+
+    def forward(self, left: Tensor, features: Tensor) -> tuple[list[list[Tensor]], list[Tensor]]:
+        x = features
+        if self.config.full_resolution_head:
+            upsampled = F.interpolate(self.feature(features), scale_factor=self.config.reduction, mode="bilinear",
+                                      align_corners=False)
+            x = self.join(torch.cat([self.image(left), F.relu(self.feature_norm(upsampled))], 1))
+        head = [layer(x) for layer in self.head]
+        levels = []
+        for steps, weights in zip(self.steps, self.weights, strict=True):
+            guidance = []
+            for i, step in enumerate(steps):
+                x = step(x)
+                if i < len(weights):
+                    guidance.append(weights[i](x))
+            levels.append(guidance)
+        return levels, head
+
+
+class _Aggregation(nn.Module):
+    """The 3D side: hourglasses with aggregation blocks, a disparity head before the first and after each."""
+
+    def __init__(self, config: GANetConfig) -> None:
+        super().__init__()
+        self.config = config
+        inputs = config.correlation_groups or 2 * config.stem[-1][0]
+        self.start = _convolution(inputs, config.volume[0], dims=3, relu=False)
+        pairs = list(zip(config.volume, config.volume[1:], strict=False))
+        self.down, self.up = nn.ModuleList(), nn.ModuleList()
+        for hourglass in range(config.hourglasses):
+            self.down.append(nn.ModuleList(_convolution(a, b, 3, 2, dims=3) if hourglass == 0 else _Join(a, b, dims=3)
+                                           for a, b in pairs))
+            # the aggregation block that follows at the top adds before it rectifies
+            self.up.append(nn.ModuleList(_Join(b, a, up=True, dims=3, relu=level > 0)
+                                         for level, (a, b) in reversed(list(enumerate(pairs)))))
+        self.blocks = nn.ModuleList(nn.ModuleList(_AggregationBlock(config.volume[level])
+                                                  for _ in range(config.blocks.get(level, 0)))
+                                    for level in range(len(config.volume)))
+        self.heads = nn.ModuleList(nn.Conv3d(config.volume[0], 1, 3, padding=1, bias=False)
+                                   for _ in range(config.hourglasses + 1))
+
+    def forward(self, volume: Tensor, guidance: tuple[list[list[Tensor]], list[Tensor]]) -> list[Tensor]:
+        levels, head = guidance
+        turns = [iter(zip(blocks, weights, strict=True)) for blocks, weights in zip(self.blocks, levels, strict=False)]
+
+        def aggregate(x: Tensor, level: int) -> Tensor:
+            if level not in self.config.aggregated_levels:
+                return F.relu(x)
+            block, weights = next(turns[level])
+            return block(x, weights)
+
+        coarsest = len(self.config.volume) - 1
+        x = aggregate(self.start(volume), 0)
+        del volume  # the largest tensor of all
+        skips, costs = [x], [self._cost(0, x)]
+        for hourglass, (down, up) in enumerate(zip(self.down, self.up, strict=True)):
+            for level, layer in enumerate(down, start=1):
+                x = layer(x) if hourglass == 0 else layer(x, skips[level])
+                x = aggregate(x, level) if level < coarsest else x
+                skips[level:] = [x, *skips[level + 1 :]]
+            for level, layer in zip(range(coarsest - 1, -1, -1), up, strict=True):
+                x = skips[level] = aggregate(layer(x, skips[level]), level)
+            costs.append(self._cost(hourglass + 1, x))
+        answers = [self._disparity(cost, []) for cost in costs[:-1] if cost is not None]
+        return [*answers, self._disparity(costs[-1], head)]
+
+    def _cost(self, head: int, x: Tensor) -> Tensor | None:
+        """(B, D, H, W); only the last head is needed outside training."""
+        return self.heads[head](x).squeeze(1).float() if self.training or head == self.config.hourglasses else None
+
+    def _disparity(self, cost: Tensor, guidance: list[Tensor]) -> Tensor:
+        """(B, H, W) in pixels at full resolution; without guidance, as the heads on the way are, by plain softmin."""
+        reduction = self.config.reduction
+        if self.config.full_resolution_head:
+            size = (self.config.max_disparity + 1, cost.shape[2] * reduction, cost.shape[3] * reduction)
+            cost = F.interpolate(cost[:, None], size, mode="trilinear", align_corners=False)[:, 0]
+            if not guidance:
+                return _expectation(F.softmin(cost, 1))
+            probability = F.softmin(local_aggregation(cost, guidance[0]), 1)
+            return _expectation(F.normalize(local_aggregation(probability, guidance[1]), p=1, dim=1))
+        if guidance:
+            cost = local_aggregation(cost, guidance[0])
+        disparity = _expectation(F.softmin(cost, 1)) * reduction
+        if guidance:
+            return convex_upsampling(disparity, guidance[1], reduction)
+        return F.interpolate(disparity[:, None], scale_factor=reduction, mode="bilinear", align_corners=False)[:, 0]
+
+
+def _expectation(probability: Tensor) -> Tensor:
+    """sum_d d p(d) for p (B, D, H, W)."""
+    disparities = torch.arange(probability.shape[1], dtype=probability.dtype, device=probability.device)
+    return torch.einsum("bdhw,d->bhw", probability, disparities)
+
+
+def convex_upsampling(disparity: Tensor, guidance: Tensor, factor: int) -> Tensor:
+    """Every fine pixel is a convex combination of the 3 x 3 coarse ones around it (Teed and Deng, RAFT, ECCV 2020).
+
+    ``disparity`` (B, H, W), ``guidance`` (B, 9 * factor^2, H, W) before the softmax -> (B, factor H, factor W).
+    """
+    batch, height, width = disparity.shape
+    weights = guidance.to(disparity.dtype).view(batch, 9, factor**2, height, width).softmax(1)
+    neighbours = F.unfold(F.pad(disparity[:, None], (1, 1, 1, 1), mode="replicate"), 3)
+    return F.pixel_shuffle((weights * neighbours.view(batch, 9, 1, height, width)).sum(1), factor)[:, 0]
+
+
+class _AggregationBlock(nn.Module):
+    """Semi-global aggregation and a 3D convolution around a skip connection."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.norm = nn.BatchNorm3d(channels)
+        self.refine = _convolution(channels, channels, dims=3, relu=False)
+
+    def forward(self, x: Tensor, guidance: Tensor) -> Tensor:
+        return F.relu_(self.refine(F.relu_(self.norm(semi_global_aggregation(x, guidance)))) + x)
+
+
+class _Join(nn.Module):
+    """Halve or double the resolution, concatenate the skip connection, convolve."""
+
+    def __init__(self, inputs: int, outputs: int, up: bool = False, dims: int = 2, relu: bool = True) -> None:
+        super().__init__()
+        kernel = (4 if dims == 2 else (3, 4, 4)) if up else 3
+        self.resize = _convolution(inputs, outputs, kernel, 2, dims, transposed=up)
+        self.fuse = _convolution(2 * outputs, outputs, dims=dims, relu=relu)
+
+    def forward(self, x: Tensor, skip: Tensor) -> Tensor:
+        return self.fuse(torch.cat([self.resize(x), skip], 1))
+
+
+def _convolution(inputs: int, outputs: int, kernel: int | tuple[int, ...] = 3, stride: int = 1, dims: int = 2,
+                 relu: bool = True, transposed: bool = False) -> nn.Sequential:
+    """Convolution without bias, batch normalisation, ReLU unless something is still to be added."""
+    kinds = {(2, False): nn.Conv2d, (3, False): nn.Conv3d, (2, True): nn.ConvTranspose2d, (3, True): nn.ConvTranspose3d}
+    padding = kernel // 2 if isinstance(kernel, int) and not transposed else 1
+    layers = [kinds[dims, transposed](inputs, outputs, kernel, stride, padding, bias=False),
+              nn.BatchNorm2d(outputs) if dims == 2 else nn.BatchNorm3d(outputs)]
+    return nn.Sequential(*layers, nn.ReLU(inplace=True)) if relu else nn.Sequential(*layers)
+
+
+def _weights(inputs: int, outputs: int) -> nn.Conv2d:
+    return nn.Conv2d(inputs, outputs, 3, padding=1, bias=False)
+
+
+def published_names(config: GANetConfig) -> dict[str, str]:
+    """This network's module names -> the authors' (whose ``cost_agg.deconv0b`` is never used).
+
+    Stands for the parameters and running statistics of each module alike: see ``learned.checkpoint``.
+    """
+    names = {"to_left": "conv_x", "to_right": "conv_y", "guidance.feature": "conv_refine",
+             "guidance.feature_norm": "bn_relu.0", "guidance.join": "guidance.conv0",
+             "aggregation.start": "cost_agg.conv_start"}
+    names |= {f"features.stem.{i}": f"feature.conv_start.{i}" for i in range(len(config.stem))}
+    names |= {f"guidance.image.{i}": f"conv_start.{i}" for i in range(2)}
+    for side, theirs, passes, depth in (("features", "feature", config.unets, len(config.features)),
+                                        ("aggregation", "cost_agg", config.hourglasses, len(config.volume) - 1)):
+        for i in range(passes):
+            for level in range(depth):
+                tail = f"{level + 1}{'ab'[i]}"
+                names[f"{side}.down.{i}.{level}"] = f"{theirs}.conv{tail}"
+                names[f"{side}.up.{i}.{depth - 1 - level}"] = f"{theirs}.deconv{tail}"
+    for level, count in config.blocks.items():
+        for i in range(count):
+            tail = f"{level or ''}{i + 1}"
+            first = {0: "conv1.{j}", 1: "conv11.{j}"}[level] if i == 0 else f"conv{tail}"
+            names |= {f"guidance.steps.{level}.{i}.{j}": f"guidance.{first.format(j=j)}" for j in range(2)} if i == 0 \
+                else {f"guidance.steps.{level}.{i}": f"guidance.conv{tail}"}
+            names[f"guidance.weights.{level}.{i}"] = f"guidance.weight_sg{tail}"
+            names[f"aggregation.blocks.{level}.{i}.norm"] = f"cost_agg.sga{tail}.bn_relu.0"
+            names[f"aggregation.blocks.{level}.{i}.refine"] = f"cost_agg.sga{tail}.conv_refine"
+    for i in range(2):
+        names |= {f"guidance.head.{i}.{j}": f"guidance.weight_lg{i + 1}.{j}" for j in range(2)}
+    names |= {f"aggregation.heads.{i}": f"cost_agg.disp{i}.conv32x1" for i in range(config.hourglasses + 1)}
+    return names

@@ -1,0 +1,171 @@
+"""GA-Net's two guided aggregation layers, as functions: semi-global (SGA) and local (LGA).
+
+Zhang, Prisacariu, Yang, Torr: GA-Net, CVPR 2019 (arXiv:1904.06587), sections 3.1 and 3.2. The plain torch versions run
+on any device and in any dtype; on the CPU in float32 the kernels of ``learned.guided_aggregation_kernels`` take over.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from learned import guided_aggregation_kernels as kernels
+
+DIRECTIONS = ("down", "up", "right", "left")
+TERMS = 5
+
+
+def semi_global_aggregation(cost: Tensor, guidance: Tensor) -> Tensor:
+    """Aggregate costs along four directions with a weight set for every pixel, channel and direction.
+
+    Along direction r: ``A(p, d) = w0 C(p, d) + w1 A(p-r, d) + w2 A(p-r, d-1) + w3 A(p-r, d+1) + w4 max_i A(p-r, i)``.
+    The five weights are divided by their L1 norm; a neighbour that does not exist is replaced by C(p, d); the result is
+    the largest of the four A.
+
+    Parameters
+    ----------
+    cost : Tensor (B, C, D, H, W)
+    guidance : Tensor (B, 4 * 5 * C, H, W)
+        Raw weights, direction outermost (down, up, right, left), then the five terms, then channels.
+
+    Returns
+    -------
+    Tensor (B, C, D, H, W)
+        In cost's dtype.
+    """
+    batch, channels, _, height, width = cost.shape
+    if guidance.shape != (batch, len(DIRECTIONS) * TERMS * channels, height, width):
+        raise ValueError(f"guidance of shape {tuple(guidance.shape)} does not fit costs of shape {tuple(cost.shape)}")
+    if cost.device.type == "cpu" and cost.dtype in (torch.float32, torch.bfloat16):
+        aggregated: Tensor = _SemiGlobal.apply(cost, guidance.float())  # the recursion is in float32
+        return aggregated.to(cost.dtype)
+    return semi_global_aggregation_reference(cost, guidance)
+
+
+def semi_global_aggregation_reference(cost: Tensor, guidance: Tensor) -> Tensor:
+    """The same in plain torch."""
+    batch, channels, _, height, width = cost.shape
+    weights = guidance.reshape(batch, len(DIRECTIONS), TERMS, channels, 1, height, width)
+    weights = F.normalize(weights, p=1, dim=2).transpose(2, 3)
+    vertical = [_sweep(cost, weights[:, 0], -2, False), _sweep(cost, weights[:, 1], -2, True)]
+    horizontal = [_sweep(cost, weights[:, 2], -1, False), _sweep(cost, weights[:, 3], -1, True)]
+    return torch.stack(vertical + horizontal).max(0).values
+
+
+def _sweep(cost: Tensor, weights: Tensor, axis: int, backwards: bool) -> Tensor:
+    """One direction: ``axis`` is the one that is walked along, from its end if ``backwards``."""
+    lines = list(zip(cost.unbind(axis), weights.unbind(axis), strict=True))
+    aggregated: list[Tensor] = []
+    for c, w in reversed(lines) if backwards else lines:
+        if not aggregated:
+            aggregated.append(c * w.sum(2))
+            continue
+        previous = aggregated[-1]
+        below = torch.cat([c[:, :, :1], previous[:, :, :-1]], 2)
+        above = torch.cat([previous[:, :, 1:], c[:, :, -1:]], 2)
+        best = previous.max(2, keepdim=True).values
+        terms = (c, previous, below, above, best)
+        aggregated.append(sum((w[:, :, k] * term for k, term in enumerate(terms)), torch.zeros_like(c)))
+    return torch.stack(aggregated[::-1] if backwards else aggregated, axis)
+
+
+class _SemiGlobal(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, cost: Tensor, guidance: Tensor) -> Tensor:
+        planes = _planes(cost)
+        weights = guidance.detach().movedim(1, -1).contiguous().unflatten(3, (len(DIRECTIONS), TERMS, -1))
+        out = torch.full_like(planes, -torch.inf)
+        # which of the four directions won: only the backward pass asks
+        chosen = torch.zeros(planes.shape if any(ctx.needs_input_grad) else (0, 0, 0), dtype=torch.uint8)
+        kernels.semi_global_forward(planes.numpy(), weights.numpy(), out.numpy(), chosen.numpy())
+        ctx.save_for_backward(planes, weights, chosen)
+        return _volume(out, cost)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor]:  # type: ignore[override]
+        planes, weights, chosen = ctx.saved_tensors
+        to_planes, to_weights = torch.zeros_like(planes), torch.empty_like(weights)
+        kernels.semi_global_backward(planes.numpy(), weights.numpy(), chosen.numpy(), _planes(gradient).numpy(),
+                                     to_planes.numpy(), to_weights.numpy())
+        return _volume(to_planes, gradient), to_weights.flatten(3).movedim(-1, 1)
+
+
+def _planes(volume: Tensor) -> Tensor:
+    """(B, C, D, H, W) -> (B, D, H * W * C + padding) float32, the layout of the kernels."""
+    batch, channels, depth, height, width = volume.shape
+    plane = height * width * channels
+    planes = torch.empty((batch, depth, plane + kernels.padding(plane)))
+    _volume(planes, volume).copy_(volume.detach())
+    return planes
+
+
+def _volume(planes: Tensor, like: Tensor) -> Tensor:
+    """The (B, C, D, H, W) view of such planes."""
+    batch, channels, depth, height, width = like.shape
+    return planes[..., : height * width * channels].view(batch, depth, height, width, channels).permute(0, 4, 1, 2, 3)
+
+
+def local_aggregation(cost: Tensor, guidance: Tensor, times: int = 2) -> Tensor:
+    """Filter a cost volume with 3 x 5 x 5 weights of each pixel's own, L1-normalised, the same at every disparity.
+
+    Parameters
+    ----------
+    cost : Tensor (B, D, H, W)
+    guidance : Tensor (B, 75, H, W)
+        Raw weights: disparity offset (-1, 0, 1) outermost, then rows, then columns (-2 ... 2). A tap that falls outside
+        the volume takes the centre's value.
+    times : int
+        How often the filter is applied.
+
+    Returns
+    -------
+    Tensor (B, D, H, W)
+        In cost's dtype.
+    """
+    batch, _, height, width = cost.shape
+    if guidance.shape != (batch, 75, height, width):
+        raise ValueError(f"guidance of shape {tuple(guidance.shape)} does not fit costs of shape {tuple(cost.shape)}")
+    dtype = cost.dtype
+    if cost.device.type == "cpu" and dtype in (torch.float32, torch.bfloat16):
+        weights = F.normalize(guidance.float(), p=1, dim=1)
+        for _ in range(times):
+            cost = _Local.apply(cost.float(), weights)
+        return cost.to(dtype)
+    return local_aggregation_reference(cost, guidance, times)
+
+
+def local_aggregation_reference(cost: Tensor, guidance: Tensor, times: int = 2) -> Tensor:
+    """The same in plain torch."""
+    weights = F.normalize(guidance, p=1, dim=1)
+    depth, height, width = cost.shape[1:]
+    inside = F.pad(torch.ones_like(cost[:1]), (2, 2, 2, 2, 1, 1))
+    for _ in range(times):
+        padded = F.pad(cost, (2, 2, 2, 2, 1, 1))
+        total = torch.zeros_like(cost)
+        for tap in range(75):
+            d, y, x = tap // 25, tap // 5 % 5, tap % 5
+            window = (slice(None), slice(d, d + depth), slice(y, y + height), slice(x, x + width))
+            total = total + weights[:, tap, None] * torch.where(inside[window] > 0, padded[window], cost)
+        cost = total
+    return cost
+
+
+class _Local(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, cost: Tensor, weights: Tensor) -> Tensor:
+        cost, weights = cost.detach().contiguous(), weights.detach().contiguous()
+        ctx.save_for_backward(cost, weights)
+        out = torch.zeros_like(cost)
+        kernels.local_forward(cost.numpy(), weights.numpy(), out.numpy())
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor]:  # type: ignore[override]
+        cost, weights = ctx.saved_tensors
+        gradient = gradient.contiguous()
+        to_cost, to_weights = torch.zeros_like(cost), torch.zeros_like(weights)
+        kernels.local_backward(cost.numpy(), weights.numpy(), gradient.numpy(), to_cost.numpy(), to_weights.numpy())
+        return to_cost, to_weights
