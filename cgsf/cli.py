@@ -18,6 +18,7 @@ COMMANDS = {
     "run": ("run", "Scene flow of four images."),
     "evaluate": ("evaluate", "Score methods on a data set."),
     "demo": ("demo", "Make a small stereo video, solve it, score it: needs no data."),
+    "gradcheck": ("gradcheck", "Check the analytic gradient against autograd and differences."),
 }
 
 

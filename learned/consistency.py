@@ -152,10 +152,10 @@ def consistency_map(state: Tensor, left1: Tensor, right1: Tensor, left2: Tensor,
     if stereo_weight > 0:
         loss = loss + stereo_weight * (photometric(left1, right1, -d1) + photometric(left2, right2, -d2))
     if flow_weight > 0:
-        loss = loss + flow_weight * visible * photometric(left1, left2, u, v)
+        loss = loss + flow_weight * (visible * photometric(left1, left2, u, v))
     if coupling_weight > 0:
         arrived = sample(d2[:, None], u, v)[:, 0]
-        loss = loss + coupling_weight * visible * penalty(d1 + change - arrived, charbonnier_px)
+        loss = loss + coupling_weight * (visible * penalty(d1 + change - arrived, charbonnier_px))
     if smoothness_weight > 0:
         first = smoothness_map(state[:, [0, 2, 3, 4]], left1, edge_sharpness, charbonnier_px)
         second = smoothness_map(state[:, 1:2], left2, edge_sharpness, charbonnier_px)

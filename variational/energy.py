@@ -133,7 +133,8 @@ class Energy:
         self._everywhere = everywhere
         self._prepared: dict[np.dtype, tuple[np.ndarray, ...]] = {}
 
-    def value_and_gradient(self, state: np.ndarray, visible: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    def value_and_gradient(self, state: np.ndarray, visible: np.ndarray | None = None,
+                           out: tuple[np.ndarray, np.ndarray] | None = None) -> tuple[np.ndarray, np.ndarray]:
         """The per-pixel map and the gradient of its sum.
 
         Parameters
@@ -142,6 +143,8 @@ class Energy:
             ``(5, H, W)``, float32 or float64, in pixels; decides the precision of everything.
         visible : np.ndarray or None
             ``(H, W)`` bool to use in place of the forward-backward check (to hold it fixed during a line search, say).
+        out : tuple of np.ndarray or None
+            Contiguous arrays of the state's type to write the map and the gradient to, in place of new ones.
 
         Returns
         -------
@@ -150,21 +153,26 @@ class Energy:
         gradient : np.ndarray
             ``(5, H, W)``, derivative of the sum, per pixel of disparity or flow.
         """
-        return self._run(state, visible, True)
+        return self._run(state, visible, True, out)
 
     def value(self, state: np.ndarray, visible: np.ndarray | None = None) -> float:
         """The energy: the sum of the map, in float64. Cheaper than with the gradient."""
-        return total(self._run(state, visible, False)[0])
+        return total(self._run(state, visible, False, None)[0])
 
-    def _run(self, state: np.ndarray, visible: np.ndarray | None, with_gradient: bool) -> tuple[np.ndarray, np.ndarray]:
+    def _run(self, state: np.ndarray, visible: np.ndarray | None, with_gradient: bool,
+             out: tuple[np.ndarray, np.ndarray] | None) -> tuple[np.ndarray, np.ndarray]:
         shape, config = self.frames.shape, self.config
         check_state(state, shape)
-        find_visible = visible is None and self.backward_flow is not None and config.flow_weight + config.coupling_weight > 0
+        uses_visible = config.flow_weight + config.coupling_weight > 0
+        find_visible = visible is None and self.backward_flow is not None and uses_visible
         if visible is not None:
             mask = _mask(visible, shape)
         else:
             mask = np.empty(shape, np.bool_) if find_visible else self._everywhere
-        loss, gradient = np.empty(shape, state.dtype), np.empty(state.shape, state.dtype)
+        loss, gradient = out or (np.empty(shape, state.dtype), np.empty(state.shape, state.dtype))
+        for array, wanted in ((loss, shape), (gradient, state.shape)):
+            if array.shape != wanted or array.dtype != state.dtype or not array.flags.c_contiguous:
+                raise ValueError(f"out must hold contiguous {state.dtype} arrays of shapes {shape} and {state.shape}")
         pull, reach = np.empty(shape, state.dtype), np.empty((shape[0], 2), np.int64)
         weights = (float(config.stereo_weight), float(config.flow_weight), float(config.coupling_weight),
                    float(config.smoothness_weight))
