@@ -17,6 +17,7 @@ from cgsf.errors import InputError
 COMMANDS = {
     "run": ("run", "Scene flow of four images."),
     "evaluate": ("evaluate", "Score methods on a data set."),
+    "report": ("report", "One table over several data sets, beside OpenCV's compositions."),
     "demo": ("demo", "Make a small stereo video, solve it, score it: needs no data."),
     "gradcheck": ("gradcheck", "Check the analytic gradient against autograd and differences."),
 }

@@ -171,8 +171,12 @@ def consistency_loss(frames: Frames, result: SceneFlow) -> np.ndarray:
 
 def solve_variational(frames: Frames, config: Any, camera: StereoCamera | None, progress: Progress | None) -> SceneFlow:
     """The handwritten solver; keeps the state that it started from."""
+    from variational.initialise import MIN_SIDE
     from variational.solver import solve as minimise
 
+    if min(frames.shape) < MIN_SIDE:
+        height, width = frames.shape
+        raise InputError(f"the images are too small ({width} x {height}): the solver needs {MIN_SIDE} pixels a side")
     solution = minimise(frames, config, camera, progress)
     initial = SceneFlow.from_state(solution.initial_state, np.ones(frames.shape, bool), method="initial state")
     return SceneFlow.from_state(

@@ -140,10 +140,7 @@ class SceneFlow:
             The names of the files.
         """
         folder = Path(folder)
-        arrays = {name: getattr(self, name) for name in (*_MAPS, "visible", *_OPTIONAL_MAPS, "camera_motion")}
-        if self.calibration is not None:
-            arrays["calibration"] = np.array(list(self.calibration.to_dict().values()))
-        npz.write_arrays(folder / "scene_flow.npz", {k: v for k, v in arrays.items() if v is not None})
+        self.save_maps(folder / "scene_flow.npz")
         kitti_png.write_disparity(folder / "disp_0.png", self.disparity1)
         kitti_png.write_disparity(folder / "disp_1.png", self.disparity2_on_left1)
         kitti_png.write_flow(folder / "flow.png", self.flow)
@@ -153,6 +150,13 @@ class SceneFlow:
             ply.write_ply(folder / "points.ply", self.points, self.motion, colours)
             names.append("points.ply")
         return names
+
+    def save_maps(self, path: str | Path) -> None:
+        """Write all maps as one ``.npz`` file, which `load` reads."""
+        arrays = {name: getattr(self, name) for name in (*_MAPS, "visible", *_OPTIONAL_MAPS, "camera_motion")}
+        if self.calibration is not None:
+            arrays["calibration"] = np.array(list(self.calibration.to_dict().values()))
+        npz.write_arrays(path, {name: array for name, array in arrays.items() if array is not None})
 
     @classmethod
     def load(cls, folder: str | Path) -> SceneFlow:
