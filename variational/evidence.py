@@ -16,8 +16,9 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
+from variational.census import popcount, stereo_costs
 from variational.jit import parallel, prange
-from variational.matching import MatchingConfig, StereoMatch, aggregate, popcount, stereo_costs
+from variational.matching import MatchingConfig, StereoMatch, aggregate
 
 
 @dataclass(frozen=True)
@@ -67,8 +68,8 @@ def _front(disparity: np.ndarray, matched: np.ndarray, front: np.ndarray) -> Non
 @parallel
 def _write_costs(
     costs: np.ndarray, disparity: np.ndarray, matched: np.ndarray, front: np.ndarray, words_left1: np.ndarray,
-    words_left2: np.ndarray, words_right2: np.ndarray, labels: np.ndarray, homographies: np.ndarray, anchor: float, hidden: float,
-    contradicted: float, time_weight: float, unknown: float, pull: float, pull_most: float,
+    words_left2: np.ndarray, words_right2: np.ndarray, labels: np.ndarray, homographies: np.ndarray, anchor: float,
+    hidden: float, contradicted: float, time_weight: float, unknown: float, pull: float, pull_most: float,
 ) -> None:  # fmt: skip
     height, width, disparities = costs.shape
     for y in prange(height):
@@ -84,7 +85,7 @@ def _write_costs(
                 h[2, 0] * x + h[2, 1] * y + h[2, 3], h[3, 0] * x + h[3, 1] * y + h[3, 3],
             )  # fmt: skip
             for d in range(disparities):
-                stereo = np.float32(costs[y, x, d])
+                stereo: float = np.float32(costs[y, x, d])
                 if x >= d:
                     seen = front[y, x - d]
                     if seen >= 0 and d < seen - 1.5:
@@ -137,8 +138,9 @@ def refill(
     _front(match1.disparity, match1.matched, front)
     _write_costs(
         costs, match1.disparity, match1.matched, front, match1.words_left, match2.words_left, match2.words_right,
-        labels.astype(np.int32), homographies.astype(f), f(config.anchor_per_px), f(config.hidden_cost), f(config.contradicted_cost),
-        f(config.time_weight), f(config.unknown_cost), f(config.background_per_px), f(config.background_most),
+        labels.astype(np.int32), homographies.astype(f), f(config.anchor_per_px), f(config.hidden_cost),
+        f(config.contradicted_cost), f(config.time_weight), f(config.unknown_cost), f(config.background_per_px),
+        f(config.background_most),
     )  # fmt: skip
     filled, _ = aggregate(costs, grey, replace(matching, small_step=config.small_step))
     return cv2.medianBlur(np.where(match1.matched, match1.disparity, filled), 5)

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from variational.census import BITS, popcount
 from variational.jit import parallel, prange
-from variational.matching import BITS, popcount
 
 FORBIDDEN = 100.0
 """Cost of a candidate that does not exist at a pixel: finite, so that sums stay finite."""

@@ -1,14 +1,13 @@
-"""Dense stereo matching: census transform and semi-global aggregation along eight paths.
+"""Dense stereo matching: semi-global aggregation of census costs along eight paths.
 
 The discrete start of everything else: robust where photometric descent has no gradient to follow, exact to about an
-eighth of a pixel after the parabola fit. Sources: Zabih and Woodfill 1994 (census), Hirschmueller 2008 (semi-global
-matching).
+eighth of a pixel after the parabola fit. Source: Hirschmueller 2008, doi:10.1109/TPAMI.2007.1166.
 
-A pixel's matching cost is the number of bits in which two census words differ: one of a 9 x 7 window, one of the same
-window spread over twice the area of the smoothed image, which sees through noise on dark roads. Aggregation runs in two
-passes, one from the top and one from the bottom: each does four of the eight paths in one sweep and holds two rows of
-path costs, so that the only large arrays are the costs (a byte each) and their two sums (two bytes each). The passes
-are independent, one thread each, and all is integer arithmetic: the same bits for any number of threads.
+A pixel's matching cost is the number of bits in which two census words differ (variational.census). Aggregation runs in
+two sweeps, one from the top and one from the bottom, a thread each. A sweep does four of the eight paths at once and
+holds two rows of path costs; the two meet in the middle, and each then completes the sums of the other and selects
+while a row is still in the cache. The only large arrays are the costs, a byte, and the sums, two bytes a pixel and
+disparity. All is integer arithmetic: the same bits for any number of threads.
 """
 
 from dataclasses import dataclass
@@ -18,15 +17,9 @@ import numpy as np
 from numba import types
 from numba.extending import intrinsic
 
-from variational.jit import parallel, prange, rowwise
+from variational.census import census, stereo_costs
+from variational.jit import parallel, prange, rowwise, scalar
 
-CENSUS_ROWS, CENSUS_COLUMNS = 3, 4
-"""Half window of the census: 7 rows x 9 columns, 62 comparisons in one 64-bit word."""
-BITS = 124
-"""Largest matching cost: all bits of both words differ. Two random windows differ in about half of them."""
-OUTSIDE_COST = 36
-"""Cost of a match outside of the right image: more than a good match (about 20), less than a random one (60), so that
-surfaces continue across the left border instead of jumping to a wrong match inside."""
 UNREACHABLE = 12000
 """Above any path cost, and still inside 16 bits with a penalty added."""
 
@@ -103,181 +96,144 @@ def _min16(typing_context, a, b):  # type: ignore[no-untyped-def]
     return signature, lambda c, builder, s, v: builder.select(builder.icmp_signed("<", *v), *v)
 
 
-@intrinsic
-def popcount(typing_context, word):  # type: ignore[no-untyped-def]
-    """Number of set bits of a 64-bit word."""
-    return types.int64(types.uint64), lambda c, builder, s, v: builder.ctpop(v[0])
-
-
-@parallel
-def _census(image: np.ndarray, spacing: int, words: np.ndarray) -> None:
-    height, width = image.shape
-    for y in prange(height):
-        words[y] = 0
-        for dy in range(-CENSUS_ROWS, CENSUS_ROWS + 1):
-            other = image[min(max(y + dy * spacing, 0), height - 1)]
-            for dx in range(-CENSUS_COLUMNS, CENSUS_COLUMNS + 1):
-                if dx == 0 and dy == 0:
-                    continue
-                for x in range(width):
-                    darker = other[min(max(x + dx * spacing, 0), width - 1)] < image[y, x]
-                    words[y, x] = (words[y, x] << np.uint64(1)) | np.uint64(darker)
-
-
-def census(grey: np.ndarray) -> np.ndarray:
-    """Census words of a grey image: fine, and twice as wide on the smoothed image.
-
-    Parameters
-    ----------
-    grey : np.ndarray
-        (H, W) float32. Positions outside take the nearest pixel.
-
-    Returns
-    -------
-    np.ndarray
-        (2, H, W) uint64; one bit a neighbour, set where it is darker than the centre.
-    """
-    words = np.empty((2, *grey.shape), np.uint64)
-    _census(np.ascontiguousarray(grey), 1, words[0])
-    _census(cv2.GaussianBlur(grey, (0, 0), 1.0), 2, words[1])
-    return words
-
-
-@parallel
-def _matching_costs(left: np.ndarray, right_mirrored: np.ndarray, costs: np.ndarray) -> None:
-    """costs (H, W, D): differing bits; OUTSIDE_COST where the match lies outside of the right image."""
-    height, width, disparities = costs.shape
-    for y in prange(height):
-        for x in range(width):
-            reach = min(x + 1, disparities)
-            mirrored = width - 1 - x
-            for d in range(reach):
-                costs[y, x, d] = popcount(left[0, y, x] ^ right_mirrored[0, y, mirrored + d]) + popcount(
-                    left[1, y, x] ^ right_mirrored[1, y, mirrored + d]
-                )
-            for d in range(reach, disparities):
-                costs[y, x, d] = OUTSIDE_COST
+@scalar
+def _path_cost(here: int, before: np.ndarray, d: int, small: int, jump: int, best: int) -> int:
+    """here + min(before, neighbours before + small, jump) - best; `before` begins at disparity -1."""
+    near = _add16(_min16(before[d], before[d + 2]), small)
+    return _add16(here, _sub16(_min16(_min16(before[d + 1], near), jump), best))
 
 
 @rowwise
-def _step(
-    cost: np.ndarray, before: np.ndarray, before_best: int, small: int, large: int, out: np.ndarray, total: np.ndarray
-) -> np.int16:
-    """One pixel of one path: out = cost + min(same, neighbours + P1, best + P2) - best; returns the new best."""
-    jump = _add16(before_best, large)
-    best = np.int16(UNREACHABLE)
-    for d in range(cost.shape[0]):
-        near = _add16(_min16(before[d], before[d + 2]), small)
-        value = _add16(cost[d], _sub16(_min16(_min16(before[d + 1], near), jump), before_best))
-        out[d + 1] = value
-        total[d] = _add16(total[d], value)
-        best = _min16(best, value)
-    return best
+def _extend(
+    cost: np.ndarray, before0: np.ndarray, before1: np.ndarray, before2: np.ndarray, before3: np.ndarray, best0: int,
+    best1: int, best2: int, best3: int, small: int, large_x: int, large_y: int, now0: np.ndarray, now1: np.ndarray,
+    now2: np.ndarray, now3: np.ndarray, total: np.ndarray,
+) -> tuple[np.int16, np.int16, np.int16, np.int16]:  # fmt: skip
+    """One pixel of four paths, the first along the row: adds their costs to `total`, returns their new bests.
+
+    Flat arguments, because arrays inside of a tuple would lose the promise that they do not overlap.
+    """
+    jump0, jump1 = _add16(best0, large_x), _add16(best1, large_y)
+    jump2, jump3 = _add16(best2, large_y), _add16(best3, large_y)
+    least0 = least1 = least2 = least3 = np.int16(UNREACHABLE)
+    for d in range(cost.size):
+        here = np.int16(cost[d])
+        value0 = _path_cost(here, before0, d, small, jump0, best0)
+        value1 = _path_cost(here, before1, d, small, jump1, best1)
+        value2 = _path_cost(here, before2, d, small, jump2, best2)
+        value3 = _path_cost(here, before3, d, small, jump3, best3)
+        now0[d + 1], now1[d + 1], now2[d + 1], now3[d + 1] = value0, value1, value2, value3
+        least0, least1 = _min16(least0, value0), _min16(least1, value1)
+        least2, least3 = _min16(least2, value2), _min16(least3, value3)
+        total[d] = _add16(total[d], _add16(_add16(value0, value1), _add16(value2, value3)))
+    return least0, least1, least2, least3
 
 
 @rowwise
-def _start(cost: np.ndarray, out: np.ndarray, total: np.ndarray) -> np.int16:
-    """A path's first pixel: its cost alone."""
-    best = np.int16(UNREACHABLE)
-    for d in range(cost.shape[0]):
-        out[d + 1] = cost[d]
-        total[d] = _add16(total[d], cost[d])
-        best = _min16(best, cost[d])
-    return best
+def _sweep_row(
+    costs: np.ndarray, large_x: np.ndarray, large_y: np.ndarray, small: int, step: int, before: np.ndarray,
+    before_best: np.ndarray, now: np.ndarray, now_best: np.ndarray, along: np.ndarray, totals: np.ndarray,
+) -> None:  # fmt: skip
+    """Add one row's four path costs to totals (W, D); step = 1 comes from the top left, -1 from the bottom right.
+
+    before, now (W + 2, 3, D + 2): path costs of the previous row and of this one. A path begins where the one before it
+    is all zeros: then its cost is the pixel's own. Columns 0 and W + 1 stay zero for that.
+    """
+    width = costs.shape[0]
+    along_best = np.int16(0)
+    along[:, 1:-1] = 0
+    for j in range(width):
+        x = j if step == 1 else width - 1 - j
+        behind, ahead = x + 1 - step, x + 1 + step
+        along_best, now_best[x + 1, 0], now_best[x + 1, 1], now_best[x + 1, 2] = _extend(
+            costs[x], along[j % 2], before[behind, 0], before[x + 1, 1], before[ahead, 2],
+            along_best, before_best[behind, 0], before_best[x + 1, 1], before_best[ahead, 2],
+            small, large_x[x if step == 1 else x + 1], large_y[x],
+            along[(j + 1) % 2], now[x + 1, 0], now[x + 1, 1], now[x + 1, 2], totals[x],
+        )  # fmt: skip
+
+
+@rowwise
+def _select_row(
+    totals: np.ndarray, tolerance: float, uniqueness: float, right_best: np.ndarray, right_at: np.ndarray,
+    disparity: np.ndarray, matched: np.ndarray,
+) -> None:  # fmt: skip
+    """Smallest total of each pixel of a row, with a parabola fit, and whether it is unique and the right view agrees.
+
+    right_best, right_at (W + D): room for the right view, from its right end: the smallest total on the diagonal of
+    each of its pixels, and its disparity. Overwrites totals (W, D).
+    """
+    width, disparities = totals.shape
+    right_best[:], right_at[:] = np.int16(32767), np.int16(-1)
+    for x in range(width):
+        row = totals[x]
+        begin = width - 1 - x
+        diagonal_best, diagonal_at = right_best[begin : begin + disparities], right_at[begin : begin + disparities]
+        best = np.int16(32767)
+        for d in range(disparities):
+            best = _min16(best, row[d])
+            better = row[d] < diagonal_best[d]
+            diagonal_at[d] = np.int16(d) if better else diagonal_at[d]
+            diagonal_best[d] = _min16(diagonal_best[d], row[d])
+        at = 0
+        while row[at] != best:
+            at += 1
+        disparity[x] = at
+        if 0 < at < disparities - 1:
+            below, above = np.float32(row[at - 1]), np.float32(row[at + 1])
+            curvature = below + above - np.float32(2) * np.float32(best)
+            if curvature > 0:
+                disparity[x] = at + (below - above) / (np.float32(2) * curvature)
+        row[max(at - 1, 0) : at + 2] = np.int16(32767)
+        runner_up = np.int16(32767)
+        for d in range(disparities):
+            runner_up = _min16(runner_up, row[d])
+        matched[x] = np.float32(runner_up) - np.float32(best) >= uniqueness
+    for x in range(width):
+        at = int(np.rint(x - disparity[x]))
+        agrees = at >= 0 and abs(right_at[width - 1 - at] - disparity[x]) <= tolerance
+        matched[x] = matched[x] and agrees
 
 
 @parallel
-def _aggregate(costs: np.ndarray, large_x: np.ndarray, large_y: np.ndarray, small: int, totals: np.ndarray) -> None:
-    """totals[k] (H, W, D): sums over four paths each, k = 0 from the top left, k = 1 from the bottom right.
+def _aggregate(
+    costs: np.ndarray, large_x: np.ndarray, large_y: np.ndarray, small: int, tolerance: float, uniqueness: float,
+    totals: np.ndarray, disparity: np.ndarray, matched: np.ndarray,
+) -> None:  # fmt: skip
+    """Two sweeps of four paths each, k = 0 from the top left and k = 1 from the bottom right, that meet in the middle.
 
-    large_x[y, x] is the large penalty between (x - 1, y) and (x, y), large_y[y, x] between (x, y - 1) and (x, y).
+    Each leaves its sums in `totals` (H, W, D), zero at first, on the half that it comes to first, and on the other half
+    completes those of its opposite and selects. large_x[y, x] is the large penalty between (x - 1, y) and (x, y),
+    large_y[y, x] between (x, y - 1) and (x, y); both have one more column or row for the first step of k = 1.
     """
     height, width, disparities = costs.shape
-    for k in prange(2):
-        total = totals[k]
-        cost = np.empty((width, disparities), np.int16)
-        # Path costs of this row and the one before: (parity, path, x, d + 1), unreachable beyond both ends of d.
-        paths = np.full((2, 3, width, disparities + 2), np.int16(UNREACHABLE), np.int16)
-        best = np.zeros((2, 3, width), np.int16)
-        along = np.full((2, disparities + 2), np.int16(UNREACHABLE), np.int16)
-        along_best = np.int16(0)
-        step = 1 - 2 * k
-        for i in range(height):
-            y = i if k == 0 else height - 1 - i
-            now, before = i % 2, (i + 1) % 2
-            cost[:] = costs[y]
-            for j in range(width):
-                x = j if k == 0 else width - 1 - j
-                row = total[y, x]
-                row[:] = 0
-                if j == 0:
-                    along_best = _start(cost[x], along[0], row)
-                else:
-                    large = large_x[y, x] if k == 0 else large_x[y, x + 1]
-                    along_best = _step(cost[x], along[(j + 1) % 2], along_best, small, large, along[j % 2], row)
-                large = large_y[y, x] if k == 0 or i == 0 else large_y[y + 1, x]
-                for r in range(3):
-                    from_x = x + (r - 1) * step
-                    if i == 0 or from_x < 0 or from_x >= width:
-                        best[now, r, x] = _start(cost[x], paths[now, r, x], row)
-                    else:
-                        come_from, least = paths[before, r, from_x], best[before, r, from_x]
-                        best[now, r, x] = _step(cost[x], come_from, least, small, large, paths[now, r, x], row)
-
-
-@parallel
-def _select(totals: np.ndarray, disparity: np.ndarray, second_view: np.ndarray, margin: np.ndarray) -> None:
-    """Smallest sum with a parabola fit; for the right view the smallest along each pixel's diagonal (-1: none)."""
-    _, height, width, disparities = totals.shape
-    for y in prange(height):
-        right_best = np.full(width, np.int16(32767), np.int16)
-        second_view[y] = -1
-        row = np.empty(disparities, np.int16)
-        for x in range(width):
-            best = np.int16(32767)
-            for d in range(disparities):
-                row[d] = _add16(totals[0, y, x, d], totals[1, y, x, d])
-                best = _min16(best, row[d])
-            at = 0
-            while row[at] != best:
-                at += 1
-            runner_up = np.int16(32767)
-            for d in range(at - 1):
-                runner_up = _min16(runner_up, row[d])
-            for d in range(at + 2, disparities):
-                runner_up = _min16(runner_up, row[d])
-            margin[y, x] = np.float32(runner_up) - np.float32(best)
-            disparity[y, x] = at
-            if 0 < at < disparities - 1:
-                below, above = np.float32(row[at - 1]), np.float32(row[at + 1])
-                curvature = below + above - np.float32(2) * np.float32(best)
-                if curvature > 0:
-                    disparity[y, x] = at + (below - above) / (np.float32(2) * curvature)
-            for d in range(min(x + 1, disparities)):
-                if row[d] < right_best[x - d]:
-                    right_best[x - d] = row[d]
-                    second_view[y, x - d] = d
-
-
-@parallel
-def _consistent(disparity: np.ndarray, second_view: np.ndarray, tolerance: float, out: np.ndarray) -> None:
-    """True where the right view's disparity at the matching pixel agrees."""
-    height, width = disparity.shape
-    for y in prange(height):
-        for x in range(width):
-            at = int(np.rint(x - disparity[y, x]))
-            out[y, x] = at >= 0 and abs(second_view[y, at] - disparity[y, x]) <= tolerance
+    # Path costs of two rows: (k, parity, x + 1, path, d + 1), unreachable beyond both ends of d, zero before the start.
+    paths = np.full((2, 2, width + 2, 3, disparities + 2), np.int16(UNREACHABLE), np.int16)
+    paths[..., 1:-1] = 0
+    best = np.zeros((2, 2, width + 2, 3), np.int16)
+    along = np.full((2, 2, disparities + 2), np.int16(UNREACHABLE), np.int16)
+    right = np.empty((2, 2, width + disparities), np.int16)
+    for half in range(2):
+        for k in prange(2):
+            meeting = height // 2 if k == 0 else height - height // 2
+            for i in range(half * meeting, meeting if half == 0 else height):
+                y = i if k == 0 else height - 1 - i
+                now, before = i % 2, (i + 1) % 2
+                _sweep_row(
+                    costs[y], large_x[y], large_y[y + k], small, 1 - 2 * k, paths[k, before], best[k, before],
+                    paths[k, now], best[k, now], along[k], totals[y],
+                )  # fmt: skip
+                if half == 1:
+                    _select_row(totals[y], tolerance, uniqueness, right[k, 0], right[k, 1], disparity[y], matched[y])
 
 
 def _large_steps(grey: np.ndarray, config: MatchingConfig) -> tuple[np.ndarray, np.ndarray]:
-    """Large penalties along x and y, (H, W) int16 each, lowered at intensity edges."""
+    """Large penalties along x (H, W + 1) and y (H + 1, W), int16, lowered at intensity edges; see _aggregate."""
     penalties = []
     for axis in (1, 0):
-        contrast = np.zeros_like(grey)
-        step = np.abs(np.diff(grey, axis=axis))
-        contrast[(slice(None),) * axis + (slice(1, None),)] = step
-        lowered = config.large_step / (1 + contrast / config.edge_contrast)
-        penalties.append(np.maximum(lowered, 1.5 * config.small_step).astype(np.int16))
+        step = np.abs(np.diff(grey, axis=axis, prepend=np.float32(0), append=np.float32(0)))
+        lowered = config.large_step / (1 + step / np.float32(config.edge_contrast))
+        penalties.append(np.maximum(lowered, np.float32(1.5 * config.small_step)).astype(np.int16))
     return penalties[0], penalties[1]
 
 
@@ -295,29 +251,33 @@ def aggregate(costs: np.ndarray, grey: np.ndarray, config: MatchingConfig) -> tu
     Returns
     -------
     disparity : np.ndarray
-        (H, W) float32 with sub-pixel fit, unfiltered.
+        (H, W) float32 with sub-pixel fit, after a median over 5 x 5.
     matched : np.ndarray
         (H, W) bool: unique, consistent with the right view, not a speckle.
     """
-    shape = costs.shape[:2]
-    totals = np.empty((2, *costs.shape), np.int16)
-    _aggregate(costs, *_large_steps(grey, config), np.int16(config.small_step), totals)
-    disparity, margin = np.empty(shape, np.float32), np.empty(shape, np.float32)
-    second_view, matched = np.empty(shape, np.int16), np.empty(shape, bool)
-    _select(totals, disparity, second_view, margin)
-    _consistent(disparity, second_view, config.consistency_px, matched)
-    matched &= margin >= config.uniqueness
+    totals = np.zeros(costs.shape, np.int16)
+    disparity, matched = np.empty(costs.shape[:2], np.float32), np.empty(costs.shape[:2], bool)
+    tolerance, uniqueness = np.float32(config.consistency_px), np.float32(config.uniqueness)
+    large_x, large_y = _large_steps(grey, config)
+    _aggregate(costs, large_x, large_y, np.int16(config.small_step), tolerance, uniqueness, totals, disparity, matched)
     disparity = cv2.medianBlur(disparity, 5)
     regions = np.where(matched, np.minimum(disparity, 2000) * 16, -16).astype(np.int16)
     cv2.filterSpeckles(regions, -16, config.speckle_px, 16)
     return disparity, regions >= 0
 
 
-def stereo_costs(words_left: np.ndarray, words_right: np.ndarray, disparities: int) -> np.ndarray:
-    """Matching costs (H, W, disparities) uint8 of the left image's pixels, in differing census bits."""
-    costs = np.empty((*words_left.shape[1:], disparities), np.uint8)
-    _matching_costs(words_left, np.ascontiguousarray(words_right[..., ::-1]), costs)
-    return costs
+@parallel
+def _fill_rows(disparity: np.ndarray, known: np.ndarray, filled: np.ndarray) -> None:
+    height, width = disparity.shape
+    for y in prange(height):
+        nearest = np.float32(np.inf)
+        for x in range(width):
+            nearest = disparity[y, x] if known[y, x] else nearest
+            filled[y, x] = nearest
+        nearest = np.float32(np.inf)
+        for x in range(width - 1, -1, -1):
+            nearest = disparity[y, x] if known[y, x] else nearest
+            filled[y, x] = min(filled[y, x], nearest)
 
 
 def fill_background(disparity: np.ndarray, known: np.ndarray) -> np.ndarray:
@@ -326,18 +286,13 @@ def fill_background(disparity: np.ndarray, known: np.ndarray) -> np.ndarray:
     What a left image's pixel hides from the right camera lies behind its neighbour: the background continues. A row
     that knows nothing takes the nearest row that does; where nothing is known at all, the result is zero.
     """
-    height, width = disparity.shape
     if not known.any():
         return np.zeros_like(disparity)
-    columns = np.arange(width)
-    left = np.maximum.accumulate(np.where(known, columns, -1), axis=1)
-    right = np.minimum.accumulate(np.where(known, columns, width)[:, ::-1], axis=1)[:, ::-1]
-    from_left = np.where(left >= 0, np.take_along_axis(disparity, np.maximum(left, 0), 1), np.inf)
-    from_right = np.where(right < width, np.take_along_axis(disparity, np.minimum(right, width - 1), 1), np.inf)
-    filled = np.minimum(from_left, from_right)
-    rows = np.flatnonzero(known.any(axis=1))
-    nearest = rows[np.abs(rows[None] - np.arange(height)[:, None]).argmin(axis=1)]
-    return np.where(known, disparity, filled[nearest]).astype(np.float32)
+    filled = np.empty_like(disparity)
+    _fill_rows(disparity, known, filled)
+    full, empty = np.flatnonzero(known.any(axis=1)), np.flatnonzero(~known.any(axis=1))
+    filled[empty] = filled[full[np.abs(full[None] - empty[:, None]).argmin(axis=1)]]
+    return filled
 
 
 def find_max_disparity(left: np.ndarray, right: np.ndarray, config: MatchingConfig) -> int:

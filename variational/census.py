@@ -1,0 +1,101 @@
+"""Census words of an image, and what it costs to match two of them.
+
+A word holds one bit for each pixel of a window: is it darker than the centre? Two words differ in few bits where they
+show the same thing, whatever the exposure; two random ones in about half. Each pixel has two words, one of a 9 x 7
+window, and one of the same window spread over twice the area of the smoothed image, which sees through noise on dark
+roads. Source: Zabih and Woodfill 1994, doi:10.1007/BFb0028345.
+"""
+
+import cv2
+import numpy as np
+from numba import types
+from numba.extending import intrinsic
+
+from variational.jit import parallel, prange, rowwise
+
+CENSUS_ROWS, CENSUS_COLUMNS = 3, 4
+"""Half window of the census: 7 rows x 9 columns, 62 comparisons in one 64-bit word."""
+BITS = 124
+"""Largest matching cost: all bits of both words differ. Two random windows differ in about half of them."""
+OUTSIDE_COST = 36
+"""Cost of a match outside of the right image: more than a good match (about 20), less than a random one (60), so that
+surfaces continue across the left border instead of jumping to a wrong match inside."""
+
+
+@intrinsic
+def popcount(typing_context, word):  # type: ignore[no-untyped-def]
+    """Number of set bits of a 64-bit word."""
+    return types.int64(types.uint64), lambda c, builder, s, v: builder.ctpop(v[0])
+
+
+@rowwise
+def _compare_row(centre: np.ndarray, other: np.ndarray, spacing: int, words: np.ndarray) -> None:
+    """Append a bit to each word for each neighbour in one row above, through or below it."""
+    for x in range(words.size):
+        word, here = words[x], centre[x]
+        for i in range(2 * CENSUS_COLUMNS + 1):
+            word = (word << np.uint64(1)) | np.uint64(other[x + i * spacing] < here)
+        words[x] = word
+
+
+@parallel
+def _census(padded: np.ndarray, spacing: int, words: np.ndarray) -> None:
+    height, width = words.shape
+    for y in prange(height):
+        words[y] = 0
+        left = CENSUS_COLUMNS * spacing
+        centre = padded[y + CENSUS_ROWS * spacing, left : left + width]
+        for i in range(2 * CENSUS_ROWS + 1):
+            _compare_row(centre, padded[y + i * spacing], spacing, words[y])
+
+
+def census(grey: np.ndarray) -> np.ndarray:
+    """Census words of a grey image: fine, and twice as wide on the smoothed image.
+
+    Parameters
+    ----------
+    grey : np.ndarray
+        (H, W) float32. Positions outside take the nearest pixel.
+
+    Returns
+    -------
+    np.ndarray
+        (2, H, W) uint64; one bit a neighbour, set where it is darker than the centre.
+    """
+    words = np.empty((2, *grey.shape), np.uint64)
+    for k, image in enumerate((grey, cv2.GaussianBlur(grey, (0, 0), 1.0))):
+        rows, columns = (k + 1) * CENSUS_ROWS, (k + 1) * CENSUS_COLUMNS
+        padded = cv2.copyMakeBorder(image, rows, rows, columns, columns, cv2.BORDER_REPLICATE)
+        _census(padded, k + 1, words[k])
+    return words
+
+
+@rowwise
+def write_matching_costs(left: np.ndarray, right_mirrored: np.ndarray, x: int, costs: np.ndarray) -> None:
+    """Costs (D,) of the disparities of pixel x of a row, in differing bits; OUTSIDE_COST where the match lies outside.
+
+    left, right_mirrored (2, W): the row's words, the right image's from its right end, so that disparities follow in
+    the order of memory.
+    """
+    reach = min(x + 1, costs.size)
+    fine, wide = left[0, x], left[1, x]
+    begin = left.shape[1] - 1 - x
+    right_fine, right_wide = right_mirrored[0, begin : begin + reach], right_mirrored[1, begin : begin + reach]
+    for d in range(reach):
+        costs[d] = popcount(fine ^ right_fine[d]) + popcount(wide ^ right_wide[d])
+    costs[reach:] = OUTSIDE_COST
+
+
+@parallel
+def _matching_costs(left: np.ndarray, right_mirrored: np.ndarray, costs: np.ndarray) -> None:
+    height, width, _ = costs.shape
+    for y in prange(height):
+        for x in range(width):
+            write_matching_costs(left[:, y], right_mirrored[:, y], x, costs[y, x])
+
+
+def stereo_costs(words_left: np.ndarray, words_right: np.ndarray, disparities: int) -> np.ndarray:
+    """Matching costs (H, W, disparities) uint8 of the left image's pixels, in differing census bits."""
+    costs = np.empty((*words_left.shape[1:], disparities), np.uint8)
+    _matching_costs(words_left, np.ascontiguousarray(words_right[..., ::-1]), costs)
+    return costs
