@@ -43,6 +43,12 @@ class Proposal:
     cost: np.ndarray
 
 
+def keep(start: Start) -> Proposal:
+    """The start as it is: nothing proposed."""
+    shape = start.state.shape[1:]
+    return Proposal(start.state, np.full(shape, MEASURED, np.int32), [], np.zeros(shape, np.float32))
+
+
 def correspondences(start: Start, tolerance_px: float = 1.0) -> Correspondences:
     """Where matched points of left1 went: flow that leads back within `tolerance_px` to points matched at both times."""
     flow = flow_of(start.state)
@@ -94,9 +100,9 @@ def propose(
     """
     matches = correspondences(start)
     motions = find_motions(matches, camera or guess_camera(matches, rigid), rigid)
-    nothing = np.full(grey.shape, MEASURED, np.int32)
     if not motions:
-        return Proposal(start.state, nothing, [], np.zeros(grey.shape, np.float32))
+        return keep(start)
+    nothing = keep(start).labels
     words = (start.match1.words_left, start.match2.words_left, start.match2.words_right)
     labels_of = np.concatenate([nothing[None], nothing[None] + 1, _nearby(motions)])
     homographies = np.stack([motion.homography for motion in motions])

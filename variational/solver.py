@@ -9,13 +9,16 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from variational.camera import StereoCamera
+from variational.descent import DescentConfig, FromZeroConfig, History, RefineConfig, descend_energy, from_zero, refine
+from variational.energy import EnergyConfig
 from variational.evidence import EvidenceConfig
 from variational.frames import Frames
 from variational.fusion import FusionConfig
 from variational.initialise import MIN_SIDE, StartName, initialise, to_grey
 from variational.matching import MatchingConfig
-from variational.proposals import MEASURED, Proposal, propose
+from variational.proposals import MEASURED, keep, propose
 from variational.rigid import RigidConfig
+from variational.terms.constancy import ConstancyConfig
 from variational.visibility import backward_flow, project_visibility
 
 logger = logging.getLogger(__name__)
@@ -29,11 +32,14 @@ class SolverConfig:
     Parameters
     ----------
     start : {"matching", "opencv", "zero"}
-        Starting state: our census matching and dense inverse search, OpenCV's matching and the same flow, or zero.
+        Starting state: our census matching and dense inverse search, OpenCV's matching and the same flow, or nothing,
+        from which a coarse-to-fine minimisation begins.
     proposals : bool
         Fuse the start with rigid motions (variational.proposals).
-    matching, rigid, fusion, evidence
+    matching, rigid, fusion, evidence, from_zero, refine, constancy
         Settings of the parts.
+    descent, energy
+        First-order descent of the consistency energy after all else, and that energy; off unless descent.levels > 0.
     """
 
     start: StartName = "matching"
@@ -42,6 +48,11 @@ class SolverConfig:
     rigid: RigidConfig = field(default_factory=RigidConfig)
     fusion: FusionConfig = field(default_factory=FusionConfig)
     evidence: EvidenceConfig = field(default_factory=EvidenceConfig)
+    from_zero: FromZeroConfig = field(default_factory=FromZeroConfig)
+    refine: RefineConfig = field(default_factory=RefineConfig)
+    constancy: ConstancyConfig = field(default_factory=ConstancyConfig)
+    descent: DescentConfig = field(default_factory=DescentConfig)
+    energy: EnergyConfig = field(default_factory=EnergyConfig)
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,13 +134,27 @@ def solve(
         seconds[name] = time.perf_counter() - begin
 
     grey = to_grey(frames.left1)
+    history: History = []
+    reason = "all stages done"
     with stage("start", 0.0):
         start = initialise(frames, config.start, config.matching)
-    proposal = Proposal(start.state, np.full(grey.shape, MEASURED, np.int32), [], np.zeros(grey.shape, np.float32))
-    if config.proposals and config.start != "zero":
-        with stage("proposals", 0.4):
+    initial = start.state
+    if config.start == "zero":
+        with stage("from zero", 0.1):
+            start, history = from_zero(frames, config.from_zero, config.constancy, config.matching)
+    proposal = keep(start)
+    if config.proposals:
+        with stage("proposals", 0.5):
             proposal = propose(start, grey, camera, config.matching, config.rigid, config.fusion, config.evidence)
-    state = proposal.state
+    with stage("refine", 0.8):
+        matched = (start.match1.matched, start.match2.matched)
+        rigid = proposal.labels != MEASURED
+        state, steps = refine(frames, proposal.state, rigid, matched, config.refine, config.constancy)
+        history += steps
+    if config.descent.levels:
+        with stage("descent", 0.85):
+            state, steps, reason = descend_energy(frames, state, start.backward_flow, config.descent, config.energy)
+            history += steps
     with stage("visibility", 0.9):
         backward = backward_flow(state, start.backward_flow)
         visible = project_visibility(state)
@@ -138,4 +163,4 @@ def solve(
         progress("done", 1.0)
     moving = proposal.labels != 0 if proposal.motions else None
     motion = proposal.motions[0].transform if proposal.motions and camera else None
-    return Solution(state, visible, confidence, moving, motion, start.state, backward, [], "start", seconds)
+    return Solution(state, visible, confidence, moving, motion, initial, backward, history, reason, seconds)
