@@ -47,8 +47,8 @@ class Oracle:
         if left1.device.type == "cpu":
             images = [_channels_last(image) for image in self._images]
             backward = None if self._backward is None else _channels_last(self._backward)
-            self._energies = [Energy(Frames(*(image[i] for image in images)), self.config, None if backward is None else backward[i])
-                              for i in range(left1.shape[0])]
+            self._energies = [Energy(Frames(*(image[i] for image in images)), self.config,
+                                     None if backward is None else backward[i]) for i in range(left1.shape[0])]
 
     def features(self, state: Tensor) -> tuple[Tensor, Tensor]:
         """Loss map ``(B, H, W)`` and gradient of its sum ``(B, 5, H, W)``, detached from every graph.
@@ -73,7 +73,8 @@ class Oracle:
         return _AnalyticEnergy.apply(state, self)
 
     def _twin_map(self, state: Tensor) -> Tensor:
-        return consistency_map(state, *self._images, self._backward, **asdict(self.config))
+        left1, right1, left2, right2 = self._images
+        return consistency_map(state, left1, right1, left2, right2, self._backward, **asdict(self.config))
 
     def _twin_features(self, state: Tensor) -> tuple[Tensor, Tensor]:
         with torch.enable_grad():

@@ -72,8 +72,8 @@ def _evaluate(state: np.ndarray, left1: np.ndarray, right1: np.ndarray, left2: n
               left2_source: np.ndarray, edges1: np.ndarray, edges2: np.ndarray, backward: np.ndarray, overlap_y: np.ndarray,
               overlap_x: np.ndarray, visible1: np.ndarray, visible2: np.ndarray, find_visible: bool, visible: np.ndarray,
               weights: tuple[float, float, float, float], alpha: float, eps_intensity: float, eps_px: float, w1: float,
-              w2: float, drop_outside: bool, bands: np.ndarray, loss: np.ndarray, gradient: np.ndarray, pull: np.ndarray,
-              reach: np.ndarray, with_gradient: bool) -> None:
+              w2: float, drop_outside: bool, bands: np.ndarray, loss: np.ndarray, gradient: np.ndarray, index: np.ndarray,
+              parts: np.ndarray, with_gradient: bool) -> None:
     """Add every term to `loss` and `gradient`. Three sweeps, because a band's stencil reads its neighbours' visibility."""
     w_stereo, w_flow, w_coupling, w_smooth = weights
     for band in prange(bands.size - 1):
@@ -97,10 +97,11 @@ def _evaluate(state: np.ndarray, left1: np.ndarray, right1: np.ndarray, left2: n
             photometric_band(left1, left2_source, state[3], state[4], 1.0, visible, overlap_y, overlap_x, w_flow, alpha,
                              eps_intensity, drop_outside, first, last, loss, gradient[3], gradient[4], with_gradient)
         if w_coupling > 0:
-            coupling_band(state, state[1].reshape(-1), visible, w_coupling, eps_px, first, last, loss, gradient, pull, reach)
+            coupling_band(state, state[1].reshape(-1), visible, w_coupling, eps_px, first, last, loss, gradient, index,
+                          parts)
     if w_coupling > 0 and with_gradient:
         for band in prange(bands.size - 1):
-            scatter_band(state[3], state[4], pull, reach, bands[band], bands[band + 1], gradient[1])
+            scatter_band(index, parts, bands[band], bands[band + 1], gradient[1].reshape(-1))
 
 
 class Energy:
@@ -173,13 +174,13 @@ class Energy:
         for array, wanted in ((loss, shape), (gradient, state.shape)):
             if array.shape != wanted or array.dtype != state.dtype or not array.flags.c_contiguous:
                 raise ValueError(f"out must hold contiguous {state.dtype} arrays of shapes {shape} and {state.shape}")
-        pull, reach = np.empty(shape, state.dtype), np.empty((shape[0], 2), np.int64)
+        index, parts = np.empty(shape, np.int32), np.empty((3, *shape), state.dtype)  # of the coupling term
         weights = (float(config.stereo_weight), float(config.flow_weight), float(config.coupling_weight),
                    float(config.smoothness_weight))
         _evaluate(state, *self._inputs(state.dtype), *self._visible, find_visible, mask, weights, float(config.ssim_share),
                   float(config.charbonnier_intensity), float(config.charbonnier_px), float(config.visible_relative),
-                  float(config.visible_absolute), bool(config.drop_outside), band_edges(shape[0]), loss, gradient, pull,
-                  reach, with_gradient)
+                  float(config.visible_absolute), bool(config.drop_outside), band_edges(shape[0]), loss, gradient, index,
+                  parts, with_gradient)
         return loss, gradient
 
     def _inputs(self, dtype: np.dtype) -> tuple[np.ndarray, ...]:

@@ -12,7 +12,7 @@ from tests.tolerances import EXACT, SINGLE_GRADIENT, SINGLE_MAP, TAYLOR_ORDER
 from variational.energy import Energy, EnergyConfig
 from variational.frames import Frames
 from variational.jit import total
-from variational.state import C, D1, D2, U, V
+from variational.state import D1, D2, C, U, V
 
 OPTIONS = EnergyConfig(drop_outside=True, charbonnier_intensity=0.01, charbonnier_px=0.05, edge_sharpness=7, ssim_share=0.6)
 TERMS = {

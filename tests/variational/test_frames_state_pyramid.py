@@ -5,7 +5,7 @@ import pytest
 
 from variational.frames import Frames
 from variational.pyramid import frames_pyramid, image_pyramid, pyramid_shapes, resize_image
-from variational.state import C, D1, D2, U, V, flow_of, resize_state, zero_state
+from variational.state import D1, D2, C, U, V, flow_of, resize_state, zero_state
 
 
 def image(shape=(6, 8, 3), dtype=np.float32, seed=0):

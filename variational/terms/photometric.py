@@ -108,29 +108,30 @@ def _warp(source: np.ndarray, vertical: np.ndarray | None, index: np.ndarray, fx
             slope_y[i] = along_y * in_y[i]
 
 
-@rowwise
-def _column_sums(a0: np.ndarray, a1: np.ndarray, a2: np.ndarray, b0: np.ndarray, b1: np.ndarray, b2: np.ndarray,
-                 sa: np.ndarray, sb: np.ndarray, saa: np.ndarray, sbb: np.ndarray, sab: np.ndarray) -> None:
-    """Sums over three rows of a, b, a^2, b^2 and a b."""
-    for i in range(sa.size):
-        sa[i] = a0[i] + a1[i] + a2[i]
-        sb[i] = b0[i] + b1[i] + b2[i]
-        saa[i] = a0[i] * a0[i] + a1[i] * a1[i] + a2[i] * a2[i]
-        sbb[i] = b0[i] * b0[i] + b1[i] * b1[i] + b2[i] * b2[i]
-        sab[i] = a0[i] * b0[i] + a1[i] * b1[i] + a2[i] * b2[i]
+@scalar
+def _column(a0: float, a1: float, a2: float, b0: float, b1: float, b2: float) -> tuple[float, ...]:
+    """Sums over one column of three pixels: of a, b, a^2, b^2 and a b."""
+    return a0 + a1 + a2, b0 + b1 + b2, a0 * a0 + a1 * a1 + a2 * a2, b0 * b0 + b1 * b1 + b2 * b2, a0 * b0 + a1 * b1 + a2 * b2
 
 
 @rowwise
-def _error(sa: np.ndarray, sb: np.ndarray, saa: np.ndarray, sbb: np.ndarray, sab: np.ndarray, a: np.ndarray, b: np.ndarray,
+def _error(a0: np.ndarray, a1: np.ndarray, a2: np.ndarray, b0: np.ndarray, b1: np.ndarray, b2: np.ndarray,
            keep: np.ndarray, alpha: float, eps: float, loss: np.ndarray, p: np.ndarray, q: np.ndarray, r: np.ndarray) -> None:
-    """Add one row's error to `loss`; P, Q and R of every pixel, times its weight in the energy."""
+    """Add one row's error to `loss`; P, Q and R of every pixel, times its weight in the energy.
+
+    The sums of the two columns before the newest are carried along, which LLVM keeps in vector registers.
+    """
     ninth, one, half, zero = real(1 / 9, eps), real(1, eps), real(0.5, eps), real(0, eps)
     c1, c2 = real(C1, eps), real(C2, eps)
+    la, lb, laa, lbb, lab = _column(a0[0], a1[0], a2[0], b0[0], b1[0], b2[0])
+    ma, mb, maa, mbb, mab = _column(a0[1], a1[1], a2[1], b0[1], b1[1], b2[1])
     for i in range(keep.size):
-        s, dp, dq, dr = ssim((sa[i] + sa[i + 1] + sa[i + 2]) * ninth, (sb[i] + sb[i + 1] + sb[i + 2]) * ninth,
-                             (saa[i] + saa[i + 1] + saa[i + 2]) * ninth, (sbb[i] + sbb[i + 1] + sbb[i + 2]) * ninth,
-                             (sab[i] + sab[i + 1] + sab[i + 2]) * ninth, c1, c2)
-        difference, _ = penalty(b[i + 1] - a[i + 1], eps)
+        ra, rb, raa, rbb, rab = _column(a0[i + 2], a1[i + 2], a2[i + 2], b0[i + 2], b1[i + 2], b2[i + 2])
+        s, dp, dq, dr = ssim((la + ma + ra) * ninth, (lb + mb + rb) * ninth, (laa + maa + raa) * ninth,
+                             (lbb + mbb + rbb) * ninth, (lab + mab + rab) * ninth, c1, c2)
+        la, lb, laa, lbb, lab = ma, mb, maa, mbb, mab
+        ma, mb, maa, mbb, mab = ra, rb, raa, rbb, rab
+        difference, _ = penalty(b1[i + 1] - a1[i + 1], eps)
         dissimilarity = (one - s) * half
         clipped = zero if dissimilarity < zero else (one if dissimilarity > one else dissimilarity)
         loss[i] += keep[i] * (alpha * clipped + (one - alpha) * difference)
@@ -141,27 +142,25 @@ def _error(sa: np.ndarray, sb: np.ndarray, saa: np.ndarray, sbb: np.ndarray, sab
 
 
 @rowwise
-def _adjoint_column_sums(p: np.ndarray, q: np.ndarray, r: np.ndarray, y: int, above: float, here: float, below: float,
-                         sp: np.ndarray, sq: np.ndarray, sr: np.ndarray) -> None:
-    """Rows y - 1, y, y + 1 of P, Q and R added with the weights of :func:`window_overlap`."""
-    i0, i1, i2 = (y + 2) % 3, y % 3, (y + 1) % 3
-    for i in range(sp.size):
-        sp[i] = above * p[i0, i] + here * p[i1, i] + below * p[i2, i]
-        sq[i] = above * q[i0, i] + here * q[i1, i] + below * q[i2, i]
-        sr[i] = above * r[i0, i] + here * r[i1, i] + below * r[i2, i]
-
-
-@rowwise
-def _gradient(sp: np.ndarray, sq: np.ndarray, sr: np.ndarray, overlap: np.ndarray, a: np.ndarray, b: np.ndarray,
-              slope_x: np.ndarray, slope_y: np.ndarray, vertical: np.ndarray | None, keep: np.ndarray, sign: float,
-              beta: float, eps: float, grad_x: np.ndarray, grad_y: np.ndarray) -> None:
-    """Add one row and channel of dE / dd."""
+def _gradient(p0: np.ndarray, p1: np.ndarray, p2: np.ndarray, q0: np.ndarray, q1: np.ndarray, q2: np.ndarray,
+              r0: np.ndarray, r1: np.ndarray, r2: np.ndarray, above: float, here: float, below: float, overlap: np.ndarray,
+              a: np.ndarray, b: np.ndarray, slope_x: np.ndarray, slope_y: np.ndarray, vertical: np.ndarray | None,
+              keep: np.ndarray, sign: float, beta: float, eps: float, grad_x: np.ndarray, grad_y: np.ndarray) -> None:
+    """Add one row and channel of dE / dd; weights `above`, `here`, `below` and `overlap` as in :func:`window_overlap`."""
+    lp, mp = above * p0[0] + here * p1[0] + below * p2[0], above * p0[1] + here * p1[1] + below * p2[1]
+    lq, mq = above * q0[0] + here * q1[0] + below * q2[0], above * q0[1] + here * q1[1] + below * q2[1]
+    lr, mr = above * r0[0] + here * r1[0] + below * r2[0], above * r0[1] + here * r1[1] + below * r2[1]
     for i in range(keep.size):
+        rp = above * p0[i + 2] + here * p1[i + 2] + below * p2[i + 2]
+        rq = above * q0[i + 2] + here * q1[i + 2] + below * q2[i + 2]
+        rr = above * r0[i + 2] + here * r1[i + 2] + below * r2[i + 2]
         left, centre, right = overlap[0, i], overlap[1, i], overlap[2, i]
         _, slope = penalty(b[i + 1] - a[i + 1], eps)
-        db = beta * keep[i] * slope + left * sp[i] + centre * sp[i + 1] + right * sp[i + 2]
-        db += (b[i + 1] + b[i + 1]) * (left * sq[i] + centre * sq[i + 1] + right * sq[i + 2])
-        db += a[i + 1] * (left * sr[i] + centre * sr[i + 1] + right * sr[i + 2])
+        db = beta * keep[i] * slope + left * lp + centre * mp + right * rp
+        db += (b[i + 1] + b[i + 1]) * (left * lq + centre * mq + right * rq)
+        db += a[i + 1] * (left * lr + centre * mr + right * rr)
+        lp, lq, lr = mp, mq, mr
+        mp, mq, mr = rp, rq, rr
         grad_x[i] += sign * db * slope_x[i]
         if vertical is not None:
             grad_y[i] += db * slope_y[i]
@@ -203,7 +202,7 @@ def photometric_band(target: np.ndarray, source: np.ndarray, dx: np.ndarray, dy:
     keep, slopes = np.empty((3, width), target.dtype), np.empty((2, channels, 3, width), target.dtype)
     warped = np.empty((channels, 3, width + 2), target.dtype)
     pqr = np.zeros((3, channels, 3, width + 2), target.dtype)
-    sums, spare = np.empty((5, width + 2), target.dtype), np.empty(width, target.dtype)
+    spare = np.empty(width, target.dtype)
     for step in range(first - 2, last + 2):
         y = step
         if 0 <= y < height:
@@ -220,15 +219,14 @@ def photometric_band(target: np.ndarray, source: np.ndarray, dx: np.ndarray, dy:
             row_loss = loss[y] if first <= y < last else spare
             for c in range(channels):
                 b = warped[c]
-                _column_sums(target[c, y], target[c, y + 1], target[c, y + 2], b[above], b[slot], b[under],
-                             sums[0], sums[1], sums[2], sums[3], sums[4])
-                _error(sums[0], sums[1], sums[2], sums[3], sums[4], target[c, y + 1], b[slot], keep[slot], alpha, eps,
-                       row_loss, pqr[0, c, slot], pqr[1, c, slot], pqr[2, c, slot])
+                _error(target[c, y], target[c, y + 1], target[c, y + 2], b[above], b[slot], b[under], keep[slot], alpha,
+                       eps, row_loss, pqr[0, c, slot], pqr[1, c, slot], pqr[2, c, slot])
         y = step - 2
         if with_gradient and first <= y < last:
-            slot = y % 3
+            slot, up, down = y % 3, (y + 2) % 3, (y + 1) % 3
             for c in range(channels):
-                _adjoint_column_sums(pqr[0, c], pqr[1, c], pqr[2, c], y, overlap_y[0, y], overlap_y[1, y], overlap_y[2, y],
-                                     sums[0], sums[1], sums[2])
-                _gradient(sums[0], sums[1], sums[2], overlap_x, target[c, y + 1], warped[c, slot], slopes[0, c, slot],
-                          slopes[1, c, slot], dy, keep[slot], sign, kind(1) - alpha, eps, grad_x[y], grad_y[y])
+                p, q, r = pqr[0, c], pqr[1, c], pqr[2, c]
+                _gradient(p[up], p[slot], p[down], q[up], q[slot], q[down], r[up], r[slot], r[down], overlap_y[0, y],
+                          overlap_y[1, y], overlap_y[2, y], overlap_x, target[c, y + 1], warped[c, slot],
+                          slopes[0, c, slot], slopes[1, c, slot], dy, keep[slot], sign, kind(1) - alpha, eps, grad_x[y],
+                          grad_y[y])
