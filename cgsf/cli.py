@@ -18,7 +18,11 @@ COMMANDS = {
     "run": ("run", "Scene flow of four images."),
     "evaluate": ("evaluate", "Score methods on a data set."),
     "report": ("report", "One table over several data sets, beside OpenCV's compositions."),
+    "train": ("train", "Train a network or a refiner by a recipe."),
     "demo": ("demo", "Make a small stereo video, solve it, score it: needs no data."),
+    "import-weights": ("import_weights", "Published GA-Net and PWC-Net checkpoints for this program."),
+    "synthesize": ("synthesize", "Render stereo video with exact truth."),
+    "check-dataset": ("check_dataset", "Warp with a data set's truth: are signs, units and pairing right?"),
     "gradcheck": ("gradcheck", "Check the analytic gradient against autograd and differences."),
 }
 

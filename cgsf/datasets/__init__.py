@@ -20,6 +20,16 @@ DATASETS: dict[str, str] = {
     "frames": "cgsf.datasets.frames:FrameFolders",
     "rendered": "cgsf.datasets.frames:FrameFolders",
     "folder": "cgsf.datasets.folder:Folder",
+    "synthetic-things": "cgsf.datasets.synthetic:Things",
+    "synthetic-street": "cgsf.datasets.synthetic:Street",
+    "synthetic-v1": "cgsf.datasets.synthetic:SyntheticV1",
+    "flyingthings3d": "cgsf.datasets.flyingthings3d:SceneFlowVideo",
+    "flyingthings3d-subset": "cgsf.datasets.flyingthings3d:FlyingThings3DSubset",
+    "monkaa": "cgsf.datasets.flyingthings3d:SceneFlowVideo",
+    "driving": "cgsf.datasets.flyingthings3d:SceneFlowVideo",
+    "kitti-raw": "cgsf.datasets.kitti_raw:KittiRaw",
+    "sintel": "cgsf.datasets.sintel:Sintel",
+    "middlebury2014": "cgsf.datasets.middlebury:Middlebury2014",
 }
 
 

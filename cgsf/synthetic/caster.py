@@ -1,7 +1,7 @@
 """The ray caster: which triangle does each ray of a camera meet first, and where.
 
-A ray is a position (x, y) in pixels, anywhere in the image, not only at pixel centres: the same kernel casts the truth's
-rays, the anti-aliasing's, the shadow map's, and the ones that tell whether a point of one image is seen in another.
+A ray is a position (x, y) in pixels anywhere in the image, not only at pixel centres: the same kernel casts the
+truth's rays, the anti-aliasing's, the shadow map's, and those that tell whether another camera sees a point.
 
 A triangle with corners V0 V1 V2 (camera coordinates) meets the ray r = ((x - cx) / fx, (y - cy) / fy, 1) where
 ``b0 V0 + b1 V1 + b2 V2 = r`` has b >= 0. Solving once per triangle makes each b linear in x and y; ``b0 + b1 + b2`` is
@@ -13,11 +13,12 @@ Rays are sorted by the pixel that they fall in, so that a triangle visits only t
 import math
 
 import numpy as np
+
 from variational.jit import rowwise
 
 #: Nothing nearer than this many metres is seen.
 NEAR_M = 0.05
-#: A ray may miss a triangle's edge by this much relative to its inverse depth, so that no ray slips between two triangles.
+#: A ray may miss a triangle's edge by this much relative to its inverse depth: none slips between two triangles.
 EDGE_SLACK = 1e-9
 
 
@@ -82,10 +83,10 @@ def setup_triangles(
             plane[n, i, 0] = r0 / fx
             plane[n, i, 1] = r1 / fy
             plane[n, i, 2] = r2 - r0 * cx / fx - r1 * cy / fy
-        bounds[n, 0] = int(math.floor(max(low_x, 0.0) + 0.5))
-        bounds[n, 1] = min(int(math.floor(min(high_x, width - 1.0) + 0.5)), width - 1)
-        bounds[n, 2] = int(math.floor(max(low_y, 0.0) + 0.5))
-        bounds[n, 3] = min(int(math.floor(min(high_y, height - 1.0) + 0.5)), height - 1)
+        bounds[n, 0] = math.floor(max(low_x, 0.0) + 0.5)
+        bounds[n, 1] = min(math.floor(min(high_x, width - 1.0) + 0.5), width - 1)
+        bounds[n, 2] = math.floor(max(low_y, 0.0) + 0.5)
+        bounds[n, 3] = min(math.floor(min(high_y, height - 1.0) + 0.5), height - 1)
 
 
 @rowwise
@@ -155,7 +156,7 @@ def sort_rays(x: np.ndarray, y: np.ndarray, height: int, width: int) -> tuple[np
     start = np.zeros(height * width + 1, np.int64)
     for ray in range(x.size):
         if x[ray] >= -0.5 and x[ray] < width - 0.5 and y[ray] >= -0.5 and y[ray] < height - 0.5:
-            cell[ray] = int(math.floor(y[ray] + 0.5)) * width + int(math.floor(x[ray] + 0.5))
+            cell[ray] = math.floor(y[ray] + 0.5) * width + math.floor(x[ray] + 0.5)
             start[cell[ray] + 1] += 1
     for i in range(height * width):
         start[i + 1] += start[i]

@@ -10,4 +10,7 @@ from cgsf.synthetic.textures import TextureSource
 from cgsf.synthetic.things import things
 
 #: name -> function (generator, textures, height, width) -> scene
-FAMILIES: dict[str, Callable[[np.random.Generator, TextureSource, int, int], Scene]] = {"street": street, "things": things}
+FAMILIES: dict[str, Callable[[np.random.Generator, TextureSource, int, int], Scene]] = {
+    "street": street,
+    "things": things,
+}

@@ -22,7 +22,9 @@ def recolored(rng: np.random.Generator) -> np.ndarray:
 def tinted(bgr: np.ndarray, texture_share: float = 0.3) -> np.ndarray:
     """The colour change (3, 4) that turns any texture into `bgr` (3,) with a grey trace of the texture."""
     bgr = np.asarray(bgr, float)
-    return np.concatenate([np.repeat(bgr[:, None] * 2 * texture_share / 3, 3, 1), bgr[:, None] * (1 - texture_share)], 1)
+    return np.concatenate(
+        [np.repeat(bgr[:, None] * 2 * texture_share / 3, 3, 1), bgr[:, None] * (1 - texture_share)], 1
+    )
 
 
 def finish(rng: np.random.Generator) -> dict[str, float]:
@@ -32,7 +34,11 @@ def finish(rng: np.random.Generator) -> dict[str, float]:
         return {}
     if kind < 0.9:
         return {"specular": rng.uniform(0.05, 0.5), "shininess": float(np.exp(rng.uniform(1.5, 4.5)))}
-    return {"specular": rng.uniform(0.3, 1.2), "shininess": float(np.exp(rng.uniform(3.5, 5.5))), "mirror": rng.uniform(0.2, 0.8)}
+    return {
+        "specular": rng.uniform(0.3, 1.2),
+        "shininess": float(np.exp(rng.uniform(3.5, 5.5))),
+        "mirror": rng.uniform(0.2, 0.8),
+    }
 
 
 def surface(source: TextureSource, repeat_m: float, *kinds: str) -> Material:
@@ -40,13 +46,26 @@ def surface(source: TextureSource, repeat_m: float, *kinds: str) -> Material:
     rng = source.rng
     texture = source.any(*kinds)
     return Material(
-        texture, recolored(rng), 1 / (repeat_m * np.exp(rng.normal(0, 0.4))), float(rng.integers(4)) * np.pi / 2 + rng.normal(0, 0.1),
-        tuple(rng.random(2)), source.kind("grain", "clouds", "cells", "marble"), rng.uniform(4, 8) / repeat_m,
-        rng.uniform(0.0, 0.6), **finish(rng),
-    )  # fmt: skip
+        texture,
+        recolored(rng),
+        scale=1 / (repeat_m * np.exp(rng.normal(0, 0.4))),
+        turn=float(rng.integers(4)) * np.pi / 2 + rng.normal(0, 0.1),
+        offset=tuple(rng.random(2)),
+        detail=source.kind("grain", "clouds", "cells", "marble"),
+        detail_scale=rng.uniform(4, 8) / repeat_m,
+        detail_strength=rng.uniform(0.0, 0.6),
+        **finish(rng),
+    )
 
 
-def upright(source: TextureSource, repeat_m: float, *kinds: str, recolor: bool = True, detail: float = 0.4, detail_m: float = 0.8) -> Material:
+def upright(
+    source: TextureSource,
+    repeat_m: float,
+    *kinds: str,
+    recolor: bool = True,
+    detail: float = 0.4,
+    detail_m: float = 0.8,
+) -> Material:
     """A surface whose texture stands upright and keeps its scale: walls, pavings, roads."""
     rng = source.rng
     matrix = recolored(rng) if recolor else np.eye(3, 4) * rng.uniform(0.8, 1.1)
@@ -56,11 +75,21 @@ def upright(source: TextureSource, repeat_m: float, *kinds: str, recolor: bool =
     )  # fmt: skip
 
 
-def paint(rng: np.random.Generator, bgr: np.ndarray | None = None, gloss: float = 0.0, mirror: float = 0.0, glow: float = 0.0) -> Material:
+def paint(
+    rng: np.random.Generator, bgr: np.ndarray | None = None, gloss: float = 0.0, mirror: float = 0.0, glow: float = 0.0
+) -> Material:
     """One colour with hardly any texture."""
     bgr = color(rng) if bgr is None else np.asarray(bgr, float)
     texture = procedural("clouds", int(rng.integers(24)))
-    return Material(texture, tinted(bgr, rng.uniform(0.02, 0.2)), rng.uniform(0.3, 1.0), specular=gloss, shininess=60.0, mirror=mirror, glow=glow)
+    return Material(
+        texture,
+        tinted(bgr, rng.uniform(0.02, 0.2)),
+        rng.uniform(0.3, 1.0),
+        specular=gloss,
+        shininess=60.0,
+        mirror=mirror,
+        glow=glow,
+    )
 
 
 def foliage(source: TextureSource) -> Material:
@@ -69,11 +98,13 @@ def foliage(source: TextureSource) -> Material:
     tint = np.array([rng.uniform(0.4, 0.9), 1.0, rng.uniform(0.5, 1.1)]) * rng.uniform(0.5, 1.2)
     if rng.random() < 0.15:
         tint = np.array([0.5, rng.uniform(0.6, 0.9), 1.3])
-    return Material(source.kind("foliage"), np.eye(3, 4) * tint[:, None], rng.uniform(0.7, 1.6), 0.0, tuple(rng.random(2)))
+    return Material(
+        source.kind("foliage"), np.eye(3, 4) * tint[:, None], rng.uniform(0.7, 1.6), 0.0, tuple(rng.random(2))
+    )
 
 
 class Wardrobe:
-    """The materials of a street's props: what all copies share is made once a scene, coats and lacquers for each copy."""
+    """The materials of a street's props: some are shared by all copies, lacquers and coats are made for each."""
 
     def __init__(self, source: TextureSource) -> None:
         rng = self.rng = source.rng
@@ -97,10 +128,9 @@ class Wardrobe:
     def lacquer(self) -> Material:
         """Car paint: white to grey, black, loud, or any colour."""
         rng = self.rng
-        bgr = (
-            np.full(3, rng.uniform(0.4, 0.95)), np.full(3, rng.uniform(0.03, 0.15)), color(rng, 0.9, rng.uniform(0.25, 0.8)),
-            color(rng, rng.uniform(0.1, 0.6)),
-        )[int(rng.choice(4, p=[0.35, 0.2, 0.2, 0.25]))]  # fmt: skip
+        light, dark = np.full(3, rng.uniform(0.4, 0.95)), np.full(3, rng.uniform(0.03, 0.15))
+        loud, any_color = color(rng, 0.9, rng.uniform(0.25, 0.8)), color(rng, rng.uniform(0.1, 0.6))
+        bgr = (light, dark, loud, any_color)[int(rng.choice(4, p=[0.35, 0.2, 0.2, 0.25]))]
         return paint(rng, bgr, rng.uniform(0.3, 1.2), rng.uniform(0.2, 0.7))
 
     def vehicle(self) -> dict[str, Material]:

@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
@@ -36,13 +37,15 @@ class Mesh:
     surface: np.ndarray
     closed: bool = False
 
-    def moved(self, translation: Sequence[float] = (0, 0, 0), rotation: Rotation | None = None) -> "Mesh":
+    def moved(self, translation: ArrayLike = (0, 0, 0), rotation: Rotation | None = None) -> "Mesh":
         """The mesh rotated about its origin, then shifted by `translation` metres."""
         turn = np.eye(3) if rotation is None else rotation.as_matrix()
-        return replace(self, points=self.points @ turn.T + np.asarray(translation, float), normals=self.normals @ turn.T)
+        return replace(
+            self, points=self.points @ turn.T + np.asarray(translation, float), normals=self.normals @ turn.T
+        )
 
-    def scaled(self, scale: float | Sequence[float]) -> "Mesh":
-        """The mesh stretched along the axes by positive factors; texture coordinates keep their metres if it is one factor."""
+    def scaled(self, scale: ArrayLike) -> "Mesh":
+        """The mesh stretched along the axes by positive factors; texture coordinates keep metres if it is one."""
         factors = np.broadcast_to(np.asarray(scale, float), 3)
         normals = self.normals / factors
         normals = normals / np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
@@ -158,7 +161,7 @@ _CUBE = np.array(  # faces, corners in order round each
 _HALVES = np.array([[0, 2, 1], [0, 3, 2]])
 
 
-def boxes(sizes: np.ndarray, middles: np.ndarray | Sequence[Sequence[float]] = ((0, 0, 0),)) -> Mesh:
+def boxes(sizes: ArrayLike, middles: ArrayLike = ((0, 0, 0),)) -> Mesh:
     """Boxes of `sizes` (K, 3) or (3,) m about `middles` (K, 3) m; the texture stands upright on their four sides."""
     sizes, middles = np.broadcast_arrays(np.atleast_2d(np.asarray(sizes, float)), np.asarray(middles, float))
     faces = _CUBE * (sizes / 2)[:, None, None]
@@ -172,7 +175,7 @@ def boxes(sizes: np.ndarray, middles: np.ndarray | Sequence[Sequence[float]] = (
     return Mesh(points, normals, uv[:, :, _HALVES].reshape(-1, 3, 2), np.repeat(np.arange(6 * count), 2), True)
 
 
-def box(size: Sequence[float]) -> Mesh:
+def box(size: ArrayLike) -> Mesh:
     """A box of `size` (x, y, z) m about the origin."""
     return boxes(np.asarray(size, float))
 
@@ -191,13 +194,18 @@ def hull(points: np.ndarray) -> Mesh:
         along = along / np.linalg.norm(along)
         uv = np.stack([(part - middle) @ along, (part - middle) @ _cross(normal, along)], -1)
         inward = np.einsum("ni,i->n", _cross(part[:, 1] - part[:, 0], part[:, 2] - part[:, 0]), normal) < 0
-        part, uv = np.where(inward[:, None, None], part[:, ::-1], part), np.where(inward[:, None, None], uv[:, ::-1], uv)
+        part, uv = (
+            np.where(inward[:, None, None], part[:, ::-1], part),
+            np.where(inward[:, None, None], uv[:, ::-1], uv),
+        )
         normals = np.broadcast_to(normal, part.shape).copy()
         meshes.append(Mesh(part, normals, uv, np.zeros(len(part), np.int64), True))
     return join(meshes)
 
 
-def sweep(profile: Callable[[np.ndarray, np.ndarray], np.ndarray], rings: int, steps: int, uv_size: Sequence[float]) -> Mesh:
+def sweep(
+    profile: Callable[[np.ndarray, np.ndarray], np.ndarray], rings: int, steps: int, uv_size: tuple[float, float]
+) -> Mesh:
     """A closed surface ``profile(s, t) -> (..., 3)`` for s in [0, 1] (rings) and t in [0, 1] (round), outwards.
 
     The texture is stretched over `uv_size` metres along s and round t.
@@ -206,7 +214,7 @@ def sweep(profile: Callable[[np.ndarray, np.ndarray], np.ndarray], rings: int, s
     return _outwards(grid(profile(s, t), np.stack([s * uv_size[0], t * uv_size[1]], -1)))
 
 
-def ellipsoid(radii: Sequence[float], rings: int = 14, steps: int = 24, power: float = 1.0,
+def ellipsoid(radii: ArrayLike, rings: int = 14, steps: int = 24, power: float = 1.0,
               bumps: np.ndarray | None = None) -> Mesh:  # fmt: skip
     """A (super-)ellipsoid about the origin; `power` < 1 is boxy, > 1 pinched.
 
@@ -217,7 +225,7 @@ def ellipsoid(radii: Sequence[float], rings: int = 14, steps: int = 24, power: f
     bumps : ndarray (K, 5), optional
         Waves on the surface: direction (3), frequency, amplitude relative to the radius.
     """
-    radii = np.asarray(radii, float)
+    axes = np.asarray(radii, float)
 
     def profile(s: np.ndarray, t: np.ndarray) -> np.ndarray:
         def shape(value: np.ndarray) -> np.ndarray:
@@ -225,14 +233,16 @@ def ellipsoid(radii: Sequence[float], rings: int = 14, steps: int = 24, power: f
 
         latitude, longitude = np.pi * (s - 0.5), 2 * np.pi * t
         around = shape(np.cos(latitude))
-        unit = np.stack([around * shape(np.cos(longitude)), shape(np.sin(latitude)), around * shape(np.sin(longitude))], -1)
+        unit = np.stack(
+            [around * shape(np.cos(longitude)), shape(np.sin(latitude)), around * shape(np.sin(longitude))], -1
+        )
         unit[..., -1, :] = unit[..., 0, :]
         if bumps is not None:
             waves = sum(wave[4] * np.sin(unit @ wave[:3] * wave[3] + index) for index, wave in enumerate(bumps))
             unit = unit * (1 + np.asarray(waves))[..., None]
-        return unit * radii
+        return unit * axes
 
-    mean = float(radii.mean())
+    mean = float(axes.mean())
     return sweep(profile, rings, steps, (np.pi * mean, 2 * np.pi * mean))
 
 
@@ -241,7 +251,9 @@ def torus(radius: float, tube: float, rings: int = 14, steps: int = 28) -> Mesh:
 
     def profile(s: np.ndarray, t: np.ndarray) -> np.ndarray:
         across = radius + tube * np.cos(2 * np.pi * s)
-        return np.stack([across * np.cos(2 * np.pi * t), tube * np.sin(2 * np.pi * s), across * np.sin(2 * np.pi * t)], -1)
+        return np.stack(
+            [across * np.cos(2 * np.pi * t), tube * np.sin(2 * np.pi * s), across * np.sin(2 * np.pi * t)], -1
+        )
 
     return sweep(profile, rings, steps, (2 * np.pi * tube, 2 * np.pi * radius))
 
@@ -260,7 +272,9 @@ def lathe(outline: np.ndarray, steps: int = 20) -> Mesh:
         length = float(np.linalg.norm(pair[1] - pair[0]))
         if length < 1e-9:
             continue
-        points = np.stack([pair[:, :1] * np.cos(angle), np.repeat(pair[:, 1:], steps + 1, 1), pair[:, :1] * np.sin(angle)], -1)
+        points = np.stack(
+            [pair[:, :1] * np.cos(angle), np.repeat(pair[:, 1:], steps + 1, 1), pair[:, :1] * np.sin(angle)], -1
+        )
         turns = np.linspace(0, 2 * np.pi * max(pair[:, 0].max(), 1e-3), steps + 1)
         uv = np.stack(np.broadcast_arrays(turns[None, :], np.array([[travelled], [travelled + length]])), -1)
         bands.append(grid(points, uv))
@@ -302,7 +316,12 @@ def star(tips: int, inner: float, outer: float, thickness: float, blunt: float =
     angle, radius = [], []
     for tip in range(tips):
         centre = 2 * tip * step
-        for offset, reach in ((-0.5 * blunt, outer), (0.5 * blunt, outer), (1 - 0.3 * blunt, inner), (1 + 0.3 * blunt, inner)):
+        for offset, reach in (
+            (-0.5 * blunt, outer),
+            (0.5 * blunt, outer),
+            (1 - 0.3 * blunt, inner),
+            (1 + 0.3 * blunt, inner),
+        ):
             angle.append(centre + offset * step)
             radius.append(reach)
     outline = np.stack([np.cos(angle), np.sin(angle), np.zeros(len(angle))], -1) * np.array(radius)[:, None]
@@ -315,10 +334,14 @@ def extrude(outline: np.ndarray, thickness: float) -> Mesh:
     outline = np.asarray(outline, float)
     count, front, back = len(outline), outline - (0, 0, thickness / 2), outline + (0, 0, thickness / 2)
     lids = [polygon(front, outline[:, :2]), polygon(back[::-1], outline[::-1, :2])]
-    sides = [polygon(np.stack([front[i], front[(i + 1) % count], back[(i + 1) % count], back[i]])) for i in range(count)]
+    sides = [
+        polygon(np.stack([front[i], front[(i + 1) % count], back[(i + 1) % count], back[i]])) for i in range(count)
+    ]
     signed = np.sum(outline[:, 0] * np.roll(outline[:, 1], -1) - np.roll(outline[:, 0], -1) * outline[:, 1])
     if signed > 0:  # one order of the corners, so that all faces look outwards together
         lids = [polygon(front[::-1], outline[::-1, :2]), polygon(back, outline[:, :2])]
     else:
-        sides = [polygon(np.stack([back[i], back[(i + 1) % count], front[(i + 1) % count], front[i]])) for i in range(count)]
+        sides = [
+            polygon(np.stack([back[i], back[(i + 1) % count], front[(i + 1) % count], front[i]])) for i in range(count)
+        ]
     return _outwards(join([*lids, *sides]))

@@ -14,7 +14,7 @@ Pattern = Callable[[np.random.Generator, int], np.ndarray]
 
 
 def noise(rng: np.random.Generator, size: int, slope: float, stretch: float = 1.0) -> np.ndarray:
-    """Power-law noise (S, S), mean 0, deviation 1: amplitude ~ 1 / frequency ** slope; `stretch` > 1 draws it along x."""
+    """Power-law noise (S, S), mean 0, deviation 1: amplitude ~ frequency ** -slope; `stretch` draws it along x."""
     fy, fx = np.fft.fftfreq(size)[:, None] * size, np.fft.rfftfreq(size)[None, :] * size
     frequency = np.hypot(fx * stretch, fy)
     frequency[0, 0] = np.inf
@@ -60,10 +60,12 @@ def plain(rng: np.random.Generator, size: int) -> np.ndarray:
 
 
 def _cells(rng: np.random.Generator, size: int, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Nearest two of `count` random points on a torus: distances (S, S, 2) in points' spacing, index, jittered points."""
+    """Nearest two of `count` random points on a torus: distances (S, S, 2) in their spacing, index, the points."""
     side = max(2, round(np.sqrt(count)))
     jitter = rng.uniform(0.0, 1.0) * (rng.random((side, side, 2)) - 0.5)
-    points = ((np.stack(np.meshgrid(np.arange(side), np.arange(side), indexing="ij"), -1) + 0.5 + jitter) / side).reshape(-1, 2)
+    points = (
+        (np.stack(np.meshgrid(np.arange(side), np.arange(side), indexing="ij"), -1) + 0.5 + jitter) / side
+    ).reshape(-1, 2)
     pixels = np.stack(np.meshgrid(np.arange(size), np.arange(size), indexing="ij"), -1).reshape(-1, 2) / size
     distance, index = cKDTree(points % 1.0, boxsize=1.0).query(pixels, k=2)
     return distance.reshape(size, size, 2) * side, index[:, 0].reshape(size, size), points
@@ -72,7 +74,9 @@ def _cells(rng: np.random.Generator, size: int, count: int) -> tuple[np.ndarray,
 def cells(rng: np.random.Generator, size: int) -> np.ndarray:
     """Cobbles, leather, mosaics, dry mud."""
     distance, index, points = _cells(rng, size, int(rng.integers(20, 400)))
-    colors = np.clip(color(rng) + rng.uniform(0.02, 0.3) * rng.standard_normal((len(points), 1 if rng.random() < 0.6 else 3)), 0, 1)
+    colors = np.clip(
+        color(rng) + rng.uniform(0.02, 0.3) * rng.standard_normal((len(points), 1 if rng.random() < 0.6 else 3)), 0, 1
+    )
     colors = np.broadcast_to(colors, (len(points), 3))
     gap = np.clip((distance[..., 1] - distance[..., 0]) / rng.uniform(0.05, 0.3), 0, 1)[..., None]
     dome = 1 - rng.uniform(0, 0.5) * distance[..., :1] ** 2
@@ -109,7 +113,9 @@ def foliage(rng: np.random.Generator, size: int) -> np.ndarray:
     image = np.full((size, size, 3), 0.5) * hue * 0.5
     spread, mean_angle = rng.uniform(10, 180), rng.random() * 180
     for step in range(900):
-        shade = np.clip(hue * (0.25 + 1.1 * step / 900 * rng.uniform(0.5, 1.2)) + 0.05 * rng.standard_normal(3), 0, 1).tolist()
+        shade = np.clip(
+            hue * (0.25 + 1.1 * step / 900 * rng.uniform(0.5, 1.2)) + 0.05 * rng.standard_normal(3), 0, 1
+        ).tolist()
         centre = rng.random(2) * size
         axes = (int(rng.integers(4, 13)), int(rng.integers(2, 5)))
         angle = mean_angle + spread * (rng.random() - 0.5)
@@ -219,7 +225,7 @@ def text(rng: np.random.Generator, size: int) -> np.ndarray:
 
 def dots(rng: np.random.Generator, size: int) -> np.ndarray:
     """Polka dots and holes in rows."""
-    distance, index, points = _cells(rng, size, int(rng.integers(4, 14)) ** 2)
+    distance, index, _ = _cells(rng, size, int(rng.integers(4, 14)) ** 2)
     radius = rng.uniform(0.15, 0.45)
     colors = np.stack([color(rng) for _ in range(int(rng.integers(1, 5)))])
     inside = np.clip((radius - distance[..., 0]) * 8, 0, 1)[..., None]
@@ -244,7 +250,10 @@ def facade(rng: np.random.Generator, size: int) -> np.ndarray:
         image *= 0.75 + 0.5 * masonry(rng, size).mean(-1, keepdims=True)
     columns, rows = int(rng.integers(1, 6)), int(rng.integers(1, 5))
     width, height = rng.uniform(0.3, 0.7) * size / columns, rng.uniform(0.4, 0.75) * size / rows
-    frame, glass = color(rng, saturation=0.1, value=rng.choice([0.2, 0.9])).tolist(), color(rng, value=rng.uniform(0.05, 0.3))
+    frame, glass = (
+        color(rng, saturation=0.1, value=rng.choice([0.2, 0.9])).tolist(),
+        color(rng, value=rng.uniform(0.05, 0.3)),
+    )
     panes, sill, sash = int(rng.integers(1, 4)), rng.random() < 0.6, max(1, int(0.06 * width))
     for row in range(rows):
         for column in range(columns):
@@ -254,7 +263,13 @@ def facade(rng: np.random.Generator, size: int) -> np.ndarray:
             pane = np.linspace(1.3, 0.6, max(1, y1 - y0))[:, None, None] * shade
             image[y0:y1, x0:x1] = np.clip(pane, 0, 1)
             if rng.random() < 0.35:  # a blind or curtain
-                cv2.rectangle(image, (x0, y0), (x1, int(y0 + rng.random() * height)), color(rng, 0.15, rng.uniform(0.4, 0.9)).tolist(), -1)
+                cv2.rectangle(
+                    image,
+                    (x0, y0),
+                    (x1, int(y0 + rng.random() * height)),
+                    color(rng, 0.15, rng.uniform(0.4, 0.9)).tolist(),
+                    -1,
+                )
             cv2.rectangle(image, (x0, y0), (x1, y1), frame, sash)
             for pane_index in range(1, panes):
                 x = int(x0 + pane_index * width / panes)
@@ -264,15 +279,17 @@ def facade(rng: np.random.Generator, size: int) -> np.ndarray:
     if rng.random() < 0.5:
         for row in range(rows):  # a cornice between the floors
             y = int(row * size / rows)
-            cv2.rectangle(image, (0, y), (size, y + max(2, size // 60)), (wall * rng.uniform(0.6, 1.2)).clip(0, 1).tolist(), -1)
+            cv2.rectangle(
+                image, (0, y), (size, y + max(2, size // 60)), (wall * rng.uniform(0.6, 1.2)).clip(0, 1).tolist(), -1
+            )
     return np.clip(image, 0, 1)
 
 
 #: kind -> function; the names are part of the seeds' meaning
 KINDS: dict[str, Pattern] = {
-    "carpet": carpet, "cells": cells, "checks": checks, "clouds": clouds, "dots": dots, "facade": facade, "foliage": foliage,
-    "grain": grain, "leaves": leaves, "marble": marble, "masonry": masonry, "plain": plain, "rust": rust, "stripes": stripes,
-    "text": text, "wood": wood,
+    "carpet": carpet, "cells": cells, "checks": checks, "clouds": clouds, "dots": dots, "facade": facade,
+    "foliage": foliage, "grain": grain, "leaves": leaves, "marble": marble, "masonry": masonry, "plain": plain,
+    "rust": rust, "stripes": stripes, "text": text, "wood": wood,
 }  # fmt: skip
 #: kinds that suit any object
 ANYWHERE = tuple(sorted(set(KINDS) - {"facade", "foliage"}))

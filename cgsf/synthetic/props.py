@@ -6,7 +6,7 @@ number of shapes, made when first asked for; every copy in a scene has its own m
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -63,7 +63,9 @@ class Placement:
     def put(self, scene: Scene, prop: Prop, materials: Mapping[str, Material]) -> None:
         """Add a copy of a prop to the scene."""
         cos, sin = np.cos(self.yaw), np.sin(self.yaw)
-        place = np.array([(cos, 0, sin, self.foot[0]), (0, 1, 0, self.foot[1]), (-sin, 0, cos, self.foot[2]), (0, 0, 0, 1)], float)
+        place = np.array(
+            [(cos, 0, sin, self.foot[0]), (0, 1, 0, self.foot[1]), (-sin, 0, cos, self.foot[2]), (0, 0, 0, 1)], float
+        )
         velocity = place[:3, 2] * self.speed
         whole = Motion(place[:3, 3], velocity, np.array([0, self.yaw_rate, 0])) if self.object_id else None
         for piece in prop:
@@ -77,7 +79,7 @@ def _shapes(count: int) -> Callable[[Callable[[np.random.Generator], Prop]], Cal
     """Turn a builder of random props into one that draws from `count` shapes, each built once."""
 
     def decorate(build: Callable[[np.random.Generator], Prop]) -> Callable[[np.random.Generator], Prop]:
-        @lru_cache(maxsize=None)
+        @cache
         def shape(variant: int) -> Prop:
             return build(np.random.default_rng([_SEED, *build.__name__.encode(), variant]))
 
@@ -86,13 +88,16 @@ def _shapes(count: int) -> Callable[[Callable[[np.random.Generator], Prop]], Cal
     return decorate
 
 
-# --- vehicles: body, glass, dark, rim, white, red, plate, load -----------------------------------------------------------
+# --- vehicles: body, glass, dark, rim, white, red, plate, load ------------------------------------------------------
 
 
 def _wheel(hub: tuple[float, float, float], radius: float, tread: float) -> list[Piece]:
     """A tyre and its spokes, on the outside of the vehicle."""
     outside = (hub[0] + np.sign(hub[0]) * (tread / 2 + 0.005), hub[1], hub[2])
-    spokes = [box((0.015, radius * 1.25, 0.07)).moved(outside, Rotation.from_rotvec((angle, 0, 0))) for angle in np.arange(3) * np.pi / 3]
+    spokes = [
+        box((0.015, radius * 1.25, 0.07)).moved(outside, Rotation.from_rotvec((angle, 0, 0)))
+        for angle in np.arange(3) * np.pi / 3
+    ]
     return [
         Piece("dark", cylinder(radius, tread, 16).moved(hub, _ACROSS), hub, 1 / radius),
         Piece("rim", join(spokes), hub, 1 / radius),
@@ -106,14 +111,21 @@ def car(rng: np.random.Generator) -> Prop:
     length, width, height = rng.uniform(3.6, 4.9), rng.uniform(1.65, 1.9), rng.uniform(1.38, 1.6)
     hood, trunk = rng.uniform(0.9, 1.35), rng.uniform(0.25, 0.9)
     if kind < 0.2:  # van
-        length, height, hood, trunk = rng.uniform(4.5, 5.5), rng.uniform(1.8, 2.3), rng.uniform(0.4, 0.9), rng.uniform(0.0, 0.15)
+        length, height, hood, trunk = (
+            rng.uniform(4.5, 5.5),
+            rng.uniform(1.8, 2.3),
+            rng.uniform(0.4, 0.9),
+            rng.uniform(0.0, 0.15),
+        )
     elif kind < 0.5:  # estate or hatchback
         trunk = rng.uniform(0.0, 0.25)
     waist, clear, x, z = height * rng.uniform(0.55, 0.64), rng.uniform(0.16, 0.26), width / 2, length / 2
 
     def slab(*levels: tuple[float, float, float, float]) -> Mesh:
         """Hull of rectangles (height, half width, z from, z to)."""
-        return hull(np.array([(side * w, -y, end) for y, w, rear, front in levels for side in (-1, 1) for end in (rear, front)]))
+        return hull(
+            np.array([(side * w, -y, end) for y, w, rear, front in levels for side in (-1, 1) for end in (rear, front)])
+        )
 
     dip = rng.uniform(0.02, 0.12)
     lower = slab(
@@ -121,14 +133,17 @@ def car(rng: np.random.Generator) -> Prop:
         (waist - 0.16, x, -z + 0.03, z - 0.07),
     )  # fmt: skip
     upper = slab(
-        (waist - 0.18, x * 0.995, -z + 0.03, z - 0.07), (waist, x * 0.93, -z + 0.1, z - hood), (waist - dip, x * 0.88, -z + 0.12, z - 0.3)
+        (waist - 0.18, x * 0.995, -z + 0.03, z - 0.07),
+        (waist, x * 0.93, -z + 0.1, z - hood),
+        (waist - dip, x * 0.88, -z + 0.12, z - 0.3),
     )
     rake_front, rake_rear = rng.uniform(0.45, 0.85), rng.uniform(0.1, 0.7) if kind > 0.2 else 0.1
     front, rear = z - hood, -z + trunk + 0.05
     roof = (rear + rake_rear, front - rake_front)
     glass = slab((waist - 0.03, x * 0.92, rear, front), (height - 0.05, x * 0.74, *roof))
     top = slab(
-        (height - 0.1, x * 0.765, roof[0] - 0.07, roof[1] + 0.08), (height - 0.03, x * 0.72, roof[0] + 0.05, roof[1] - 0.05),
+        (height - 0.1, x * 0.765, roof[0] - 0.07, roof[1] + 0.08),
+        (height - 0.03, x * 0.72, roof[0] + 0.05, roof[1] - 0.05),
         (height, x * 0.5, roof[0] + 0.25, roof[1] - 0.2),
     )  # fmt: skip
     pillars = []
@@ -147,7 +162,9 @@ def car(rng: np.random.Generator) -> Prop:
         Piece("dark", box((width * 0.8, 0.1, length * 0.9)).moved((0, -clear, 0))),
         Piece("plate", boxes((0.52, 0.12, 0.05), [(0, -0.5, end + 0.03 * np.sign(end)) for end, _ in ends])),
     ]  # fmt: skip
-    pieces += [Piece(name, boxes(lamp_size, [(s * (x - 0.26), -lamp_height, end) for s in (-1, 1)])) for end, name in ends]
+    pieces += [
+        Piece(name, boxes(lamp_size, [(s * (x - 0.26), -lamp_height, end) for s in (-1, 1)])) for end, name in ends
+    ]
     radius = rng.uniform(0.29, 0.36)
     for side in (-1, 1):
         for axle in (-z + 0.75, z - 0.8):
@@ -160,14 +177,23 @@ def truck(rng: np.random.Generator) -> Prop:
     """A lorry or bus: a large box on wheels behind a cab."""
     length, width, height = rng.uniform(5.5, 12), rng.uniform(2.1, 2.5), rng.uniform(2.4, 3.6)
     low, high = rng.uniform(0.4, 0.6), min(height, rng.uniform(2.2, 3.0))
-    nose = np.array([(s * width * 0.48, -y, z) for s in (-1, 1) for y, z in ((low, 0), (low, 1.75), (1.3, 1.8), (high, 1.5), (high, 0))])
-    pane = box((width * 0.9, 0.35 * high, 0.05)).moved((0, -0.72 * high, length / 2 - 0.14), Rotation.from_rotvec((-0.2, 0, 0)))
+    nose = np.array(
+        [
+            (s * width * 0.48, -y, z)
+            for s in (-1, 1)
+            for y, z in ((low, 0), (low, 1.75), (1.3, 1.8), (high, 1.5), (high, 0))
+        ]
+    )
+    pane = box((width * 0.9, 0.35 * high, 0.05)).moved(
+        (0, -0.72 * high, length / 2 - 0.14), Rotation.from_rotvec((-0.2, 0, 0))
+    )
     lamps = [(s * (width / 2 - 0.25), -0.85, -length / 2) for s in (-1, 1)]
     pieces = [
         Piece("load", box((width, height - 0.9, length - 1.8)).moved((0, -(height + 0.9) / 2, -0.9))),
         Piece("body", hull(nose).moved((0, 0, length / 2 - 1.85))), Piece("glass", pane),
         Piece("dark", box((width * 0.8, 0.3, length - 0.6)).moved((0, -0.75, -0.1))),
-        Piece("red", boxes((0.25, 0.2, 0.06), lamps)), Piece("plate", box((0.52, 0.12, 0.05)).moved((0, -0.7, -length / 2))),
+        Piece("red", boxes((0.25, 0.2, 0.06), lamps)),
+        Piece("plate", box((0.52, 0.12, 0.05)).moved((0, -0.7, -length / 2))),
         Piece("rim", box((width, 0.12, 0.12)).moved((0, -0.5, -length / 2 + 0.1))),
     ]  # fmt: skip
     radius = rng.uniform(0.42, 0.52)
@@ -177,14 +203,19 @@ def truck(rng: np.random.Generator) -> Prop:
     return tuple(pieces)
 
 
-# --- people: coat, trousers, skin, hair, and dark, rim for the bicycle ------------------------------------------------------
+# --- people: coat, trousers, skin, hair, and dark, rim for the bicycle ----------------------------------------------
 
 
 def _human(rng: np.random.Generator, riding: bool) -> list[Piece]:
     tall, lift = rng.uniform(1.55, 1.9), 0.25 if riding else 0.0
     hip, chest, head = 0.5 * tall + lift, 0.7 * tall + lift, 0.93 * tall + lift
     pieces = [
-        Piece("coat", ellipsoid((rng.uniform(0.18, 0.25), 0.17 * tall, rng.uniform(0.11, 0.16)), 8, 12, 0.8).moved((0, -chest, 0))),
+        Piece(
+            "coat",
+            ellipsoid((rng.uniform(0.18, 0.25), 0.17 * tall, rng.uniform(0.11, 0.16)), 8, 12, 0.8).moved(
+                (0, -chest, 0)
+            ),
+        ),
         Piece("skin", ellipsoid((0.085, 0.12, 0.1), 8, 10).moved((0, -head, 0))),
         Piece("hair", ellipsoid((0.095, 0.07, 0.11), 6, 10).moved((0, -head - 0.04 * tall, -0.01))),
     ]
@@ -193,7 +224,14 @@ def _human(rng: np.random.Generator, riding: bool) -> list[Piece]:
         angle, thigh = side * lean, (side * 0.09, -hip, 0.0)
         foot = (side * 0.1, -hip + 0.48 * tall * np.cos(angle), 0.48 * tall * np.sin(angle))
         pieces.append(Piece("trousers", tube(np.array([thigh, foot]), 0.075, 7), thigh, swing=side * rate))
-        pieces.append(Piece("trousers", box((0.09, 0.08, 0.25)).moved((foot[0], foot[1] + 0.02, foot[2] + 0.06)), thigh, swing=side * rate))
+        pieces.append(
+            Piece(
+                "trousers",
+                box((0.09, 0.08, 0.25)).moved((foot[0], foot[1] + 0.02, foot[2] + 0.06)),
+                thigh,
+                swing=side * rate,
+            )
+        )
         hand = (side * 0.26, -(0.62 if riding else 0.55) * tall - lift, 0.45 if riding else -0.3 * tall * np.sin(angle))
         pieces.append(Piece("coat", tube(np.array([(side * 0.2, -0.81 * tall - lift, 0), hand]), 0.05, 6)))
     return pieces
@@ -210,16 +248,18 @@ def cyclist(rng: np.random.Generator) -> Prop:
     """A rider on two thin wheels."""
     angle = np.linspace(0, 2 * np.pi, 21)
     angle[-1] = 0.0
-    rings = [np.stack([np.zeros(21), 0.33 * np.sin(angle) - 0.34, 0.33 * np.cos(angle) + axle], -1) for axle in (-0.5, 0.55)]
-    bars = ([(0, -0.34, -0.5), (0, -0.85, -0.15)], [(0, -0.34, 0.55), (0, -1.0, 0.4)], [(0, -0.8, -0.15), (0, -0.8, 0.42)],
-            [(0, -0.35, 0.0), (0, -0.8, 0.42)], [(-0.25, -1.02, 0.42), (0.25, -1.02, 0.42)])  # fmt: skip
+    rings = [
+        np.stack([np.zeros(21), 0.33 * np.sin(angle) - 0.34, 0.33 * np.cos(angle) + axle], -1) for axle in (-0.5, 0.55)
+    ]
+    bars = ([(0, -0.34, -0.5), (0, -0.85, -0.15)], [(0, -0.34, 0.55), (0, -1.0, 0.4)],
+            [(0, -0.8, -0.15), (0, -0.8, 0.42)], [(0, -0.35, 0.0), (0, -0.8, 0.42)], [(-0.25, -1.02, 0.42), (0.25, -1.02, 0.42)])  # fmt: skip
     pieces = _human(rng, riding=True)
     pieces.append(Piece("dark", join([tube(ring, 0.025, 5) for ring in rings])))
     pieces.append(Piece("rim", join([tube(np.array(bar, float), 0.022, 5) for bar in bars])))
     return tuple(pieces)
 
 
-# --- plants: bark, leaf -----------------------------------------------------------------------------------------------------
+# --- plants: bark, leaf ---------------------------------------------------------------------------------------------
 
 
 def _leaf_cloud(rng: np.random.Generator, count: int, radii: np.ndarray, size: float) -> Mesh:
@@ -234,7 +274,9 @@ def _leaf_cloud(rng: np.random.Generator, count: int, radii: np.ndarray, size: f
     extent = size * rng.uniform(0.5, 1.4, (count, 1))
     a, b = first * extent, second * extent * 0.6
     points = np.stack([middle - a, middle + b, middle + a, middle - a, middle + a, middle - b], 1).reshape(-1, 3, 3)
-    uv = np.tile(np.array([(-1, 0), (0, 0.6), (1, 0), (-1, 0), (1, 0), (0, -0.6)]).reshape(2, 3, 2) * size, (count, 1, 1))
+    uv = np.tile(
+        np.array([(-1, 0), (0, 0.6), (1, 0), (-1, 0), (1, 0), (0, -0.6)]).reshape(2, 3, 2) * size, (count, 1, 1)
+    )
     uv = uv + np.repeat(rng.random((count, 1, 2)) * 3, 2, axis=0)
     return Mesh(points, np.repeat(np.repeat(direction[:, None], 3, 1), 2, 0), uv, np.repeat(np.arange(count), 2))
 
@@ -250,14 +292,18 @@ def _lump(rng: np.random.Generator, radii: np.ndarray, middle: np.ndarray, leave
 def tree(rng: np.random.Generator) -> Prop:
     """A trunk with branches and a crown of leaves, 4 to 10 m tall."""
     height, trunk, girth = rng.uniform(4, 10), rng.uniform(1.6, 3.2), rng.uniform(0.08, 0.22)
-    pieces = [Piece("bark", lathe(np.array([[girth * 1.3, 0.0], [girth, -trunk * 0.4], [girth * 0.6, -trunk - 1.0]]), 9))]
+    pieces = [
+        Piece("bark", lathe(np.array([[girth * 1.3, 0.0], [girth, -trunk * 0.4], [girth * 0.6, -trunk - 1.0]]), 9))
+    ]
     crown, spread = np.array([0, -(trunk + (height - trunk) / 2), 0]), (height - trunk) * rng.uniform(0.28, 0.5)
     for _ in range(int(rng.integers(2, 5))):
         branch = crown + rng.standard_normal(3) * spread * (0.5, 0.4, 0.5)
         pieces.append(Piece("bark", tube(np.array([(0, -trunk * 0.8, 0), branch]), girth * 0.35, 5)))
     for _ in range(int(rng.integers(3, 6))):
         middle = crown + rng.standard_normal(3) * spread * (0.5, 0.45, 0.5)
-        lump = _lump(rng, spread * rng.uniform(0.5, 0.95, 3), middle, int(rng.integers(120, 300)), rng.uniform(0.09, 0.2))
+        lump = _lump(
+            rng, spread * rng.uniform(0.5, 0.95, 3), middle, int(rng.integers(120, 300)), rng.uniform(0.09, 0.2)
+        )
         pieces += lump if rng.random() < 0.85 else lump[1:]
     return tuple(pieces)
 
@@ -273,7 +319,7 @@ def bush(rng: np.random.Generator) -> Prop:
     return tuple(pieces)
 
 
-# --- furniture of the street: metal, lamp, frame, face, body ----------------------------------------------------------------
+# --- furniture of the street: metal, lamp, frame, face, body --------------------------------------------------------
 
 
 @_shapes(12)

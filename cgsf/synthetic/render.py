@@ -189,7 +189,9 @@ def make_scene(family: str, seed: int, height: int, width: int, config: RenderCo
     if height < 16 or width < 16:
         raise InputError(f"images must be at least 16 x 16 pixels, got {height} x {width}")
     rng = np.random.default_rng([sorted(FAMILIES).index(family), seed])
-    source = TextureSource(np.random.default_rng([sorted(FAMILIES).index(family), seed, 1]), config.photos, config.photo_share)
+    source = TextureSource(
+        np.random.default_rng([sorted(FAMILIES).index(family), seed, 1]), config.photos, config.photo_share
+    )
     return FAMILIES[family](rng, source, height, width)
 
 
@@ -221,7 +223,9 @@ def make_video(family: str, seed: int, height: int, width: int, frames: int, **o
     """
     unknown = set(options) - {field.name for field in fields(RenderConfig)}
     if unknown:
-        raise InputError(f"unknown option {sorted(unknown)[0]!r}; known are {', '.join(f.name for f in fields(RenderConfig))}")
+        raise InputError(
+            f"unknown option {sorted(unknown)[0]!r}; known are {', '.join(f.name for f in fields(RenderConfig))}"
+        )
     if frames < 2:
         raise InputError(f"a video has at least 2 frames, got {frames}")
     config = RenderConfig(**options)
@@ -231,16 +235,20 @@ def make_video(family: str, seed: int, height: int, width: int, frames: int, **o
     renderer = Renderer(scene, height, width, config)
     calibration = Calibration.from_camera(scene.camera)
     samples: list[Sample] = []
-    scale, before = 0.0, None
+    scale = 0.0
+    before: tuple[View, View, tuple[np.ndarray, np.ndarray]] | None = None
     for frame in range(frames):
         left, right, left_radiance, right_radiance = renderer.exposed(float(frame))
         scale = scale or sensor.scale(left_radiance)
-        images = [sensor.develop(radiance, scale, side, frame, rng) for side, radiance in enumerate((left_radiance, right_radiance))]
+        images = [
+            sensor.develop(radiance, scale, side, frame, rng)
+            for side, radiance in enumerate((left_radiance, right_radiance))
+        ]
         if before is not None:
             truth = truth_of(renderer, before[0], before[1], left, right)
             name = f"{family}-{seed:06d}" + (f"/{frame - 1:03d}" if frames > 2 else "")
-            samples.append(Sample(name, *before[2], *images, calibration=calibration, truth=truth))
-        before = (left, right, images)
+            samples.append(Sample(name, *before[2], images[0], images[1], calibration, truth))
+        before = (left, right, (images[0], images[1]))
     return samples
 
 

@@ -75,7 +75,7 @@ class Material:
 
 @dataclass(frozen=True)
 class Motion:
-    """Rigid motion at a constant rate: `velocity` (3,) m/frame, `spin` (3,) rotation vector rad/frame about `pivot` (3,) m."""
+    """Rigid motion at a constant rate: `velocity` (3,) m/frame, `spin` (3,) rad/frame about `pivot` (3,) m."""
 
     pivot: np.ndarray
     velocity: np.ndarray
@@ -208,7 +208,12 @@ class Scene:
     parts: list[Part] = field(default_factory=list)
 
     def add(
-        self, mesh: Mesh, material: Material, motion: Motion | None = None, object_id: int = 0, place: np.ndarray = _HERE
+        self,
+        mesh: Mesh,
+        material: Material,
+        motion: Motion | None = None,
+        object_id: int = 0,
+        place: np.ndarray = _HERE,
     ) -> None:
         """Put a mesh into the scene; `place` (4, 4) takes its coordinates to the world's at time 0."""
         self.parts.append(Part(mesh, material, place, motion, object_id))
@@ -299,7 +304,12 @@ class Soup:
 
 @rowwise
 def _place(
-    points: np.ndarray, normals: np.ndarray, part: np.ndarray, places: np.ndarray, points_out: np.ndarray, normals_out: np.ndarray
+    points: np.ndarray,
+    normals: np.ndarray,
+    part: np.ndarray,
+    places: np.ndarray,
+    points_out: np.ndarray,
+    normals_out: np.ndarray,
 ) -> None:
     """Rigidly move every triangle by its part's matrix."""
     for n in range(points.shape[0]):
@@ -309,4 +319,6 @@ def _place(
                 points_out[n, c, i] = (
                     m[i, 0] * points[n, c, 0] + m[i, 1] * points[n, c, 1] + m[i, 2] * points[n, c, 2] + m[i, 3]
                 )
-                normals_out[n, c, i] = m[i, 0] * normals[n, c, 0] + m[i, 1] * normals[n, c, 1] + m[i, 2] * normals[n, c, 2]
+                normals_out[n, c, i] = (
+                    m[i, 0] * normals[n, c, 0] + m[i, 1] * normals[n, c, 1] + m[i, 2] * normals[n, c, 2]
+                )

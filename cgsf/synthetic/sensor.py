@@ -55,7 +55,9 @@ class Sensor:
             exposure=rng.uniform(0.32, 0.58),
             gamma=rng.uniform(0.4, 0.65),
             grey=bool(rng.random() < 0.12),
-            gain=1 + rng.uniform(0, 0.06) * rng.standard_normal((2, 1)) + rng.uniform(0, 0.02) * rng.standard_normal((2, 3)),
+            gain=1
+            + rng.uniform(0, 0.06) * rng.standard_normal((2, 1))
+            + rng.uniform(0, 0.02) * rng.standard_normal((2, 3)),
             flicker=1 + 0.01 * rng.standard_normal(frames),
             vignetting=rng.uniform(0, 0.3) * float(rng.random() < 0.5),
             blur_px=rng.uniform(0.0, 0.8),
@@ -69,7 +71,9 @@ class Sensor:
         # pictures are judged on every fourth pixel
         return float((self.exposure / max(float(np.sqrt(radiance[::4, ::4].mean(-1)).mean()), 1e-6)) ** 2)
 
-    def develop(self, radiance: np.ndarray, scale: float, camera: int, frame: int, rng: np.random.Generator) -> np.ndarray:
+    def develop(
+        self, radiance: np.ndarray, scale: float, camera: int, frame: int, rng: np.random.Generator
+    ) -> np.ndarray:
         """The picture (H, W, 3) float32 in [0, 1] of `radiance` by camera 0 (left) or 1 (right)."""
         gain = np.ones(3) if self.gain is None else self.gain[camera]
         factor = scale * gain * (1.0 if self.flicker is None else self.flicker[frame])
@@ -87,7 +91,9 @@ class Sensor:
 
 
 @rowwise
-def _expose(radiance: np.ndarray, factor: np.ndarray, vignetting: float, curve: np.ndarray, grey: bool, out: np.ndarray) -> None:
+def _expose(
+    radiance: np.ndarray, factor: np.ndarray, vignetting: float, curve: np.ndarray, grey: bool, out: np.ndarray
+) -> None:
     """Gains, vignetting, clip and tone curve; `curve` (K,) is a table over the square root of the light."""
     height, width = radiance.shape[0], radiance.shape[1]
     last = curve.size - 2
@@ -96,7 +102,11 @@ def _expose(radiance: np.ndarray, factor: np.ndarray, vignetting: float, curve: 
         for column in range(width):
             x = 2.0 * column / (width - 1) - 1.0
             light = 1.0 - vignetting * 0.5 * (x * x + y * y)
-            b, g, r = radiance[row, column, 0] * factor[0], radiance[row, column, 1] * factor[1], radiance[row, column, 2] * factor[2]
+            b, g, r = (
+                radiance[row, column, 0] * factor[0],
+                radiance[row, column, 1] * factor[1],
+                radiance[row, column, 2] * factor[2],
+            )
             if grey:
                 b = g = r = 0.114 * b + 0.587 * g + 0.299 * r
             for channel in range(3):

@@ -1,7 +1,7 @@
 """From hits to colours: textures, light, shadows, highlights, mirrors, haze.
 
-Colours are linear radiance, BGR. A pixel inside a smooth surface is shaded once, at its centre, with the texture filtered
-to the pixel's footprint. A pixel at an edge casts more rays and is shaded once for each surface that they meet.
+Colours are linear radiance, BGR. A pixel inside a smooth surface is shaded once, at its centre, with the texture
+filtered to the pixel's footprint. A pixel at an edge casts more rays and is shaded once for each surface they meet.
 """
 
 import math
@@ -10,8 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cgsf.synthetic.caster import Caster
-from variational.jit import rowwise, scalar
-
+from variational.jit import rowwise
 
 #: Share of the pixel over which textures are averaged: a little less than all keeps pictures crisp.
 _SHARPNESS = 0.85
@@ -21,12 +20,13 @@ _SHARPNESS = 0.85
 TEXTURE = np.dtype([("start", np.int64), ("size", np.int64), ("mirrored", np.bool_)], align=True)
 
 _VECTOR = (np.float64, (3,))
-#: Light and surroundings of one moment; see `scene.Light` and `scene.Sky`. Records, unlike tuples of arrays, cost kernels nothing.
+#: Light and surroundings of one moment; see `scene.Light` and `scene.Sky`.
 ILLUMINATION = np.dtype(
     [
         ("position", *_VECTOR), ("color", *_VECTOR), ("above", *_VECTOR), ("below", *_VECTOR), ("horizon", *_VECTOR),
         ("zenith", *_VECTOR), ("falloff_m", np.float64), ("cloud_strength", np.float64), ("haze_per_m", np.float64),
-        ("shadow_pose", np.float64, (4, 4)), ("shadow_focal", np.float64), ("shadow_bias_m", np.float64), ("gloss", np.float64),
+        ("shadow_pose", np.float64, (4, 4)), ("shadow_focal", np.float64), ("shadow_bias_m", np.float64),
+        ("gloss", np.float64),
     ],
     align=True,
 )  # fmt: skip
@@ -44,15 +44,17 @@ class Surfaces(NamedTuple):
     atlas: np.ndarray
 
 
-@scalar
-def _texel(atlas: np.ndarray, place: int) -> int:
+@rowwise
+def _texel(atlas: np.ndarray, place: int) -> np.int64:
     """The three channels of a texel, 21 bits apart, so that one multiplication weighs all of them."""
     packed = np.int64(atlas[place])
     return (packed & 0xFF) | ((packed & 0xFF00) << 13) | ((packed & 0xFF0000) << 26)
 
 
-@scalar
-def _level(atlas: np.ndarray, start: int, size: int, mirrored: bool, u: float, v: float, weight: float, out: np.ndarray) -> None:
+@rowwise
+def _level(
+    atlas: np.ndarray, start: int, size: int, mirrored: bool, u: float, v: float, weight: float, out: np.ndarray
+) -> None:
     """Add `weight` times the bilinear value of one texture copy at (u, v) in repeats, pixel centres at halves."""
     x, y = u * size - 0.5, v * size - 0.5
     fx, fy = math.floor(x), math.floor(y)
@@ -78,10 +80,10 @@ def _level(atlas: np.ndarray, start: int, size: int, mirrored: bool, u: float, v
     out[2] += scale * (total >> 42)
 
 
-@scalar
+@rowwise
 def _texture(
-    atlas: np.ndarray, start: int, size: int, mirrored: bool, u: float, v: float, texels: float, smooth: bool, weight: float,
-    out: np.ndarray,
+    atlas: np.ndarray, start: int, size: int, mirrored: bool, u: float, v: float, texels: float, smooth: bool,
+    weight: float, out: np.ndarray,
 ) -> None:  # fmt: skip
     """Add `weight` times a texture's value; `texels` of the largest copy lie under the pixel, and choose the copy.
 
@@ -101,8 +103,10 @@ def _texture(
         _level(atlas, start + size * size, size >> 1, mirrored, u, v, weight * mix, out)
 
 
-@scalar
-def _sky(atlas: np.ndarray, size: int, illumination: np.ndarray, dx: float, dy: float, dz: float, out: np.ndarray) -> None:
+@rowwise
+def _sky(
+    atlas: np.ndarray, size: int, illumination: np.ndarray, dx: float, dy: float, dz: float, out: np.ndarray
+) -> None:
     """Radiance (3,) from direction (dx, dy, dz), unit length, y down; the clouds are the atlas's first texture."""
     light = illumination[0]
     if dy > 0.0:  # below the horizon: the ground's mean colour, for mirrors
@@ -119,7 +123,7 @@ def _sky(atlas: np.ndarray, size: int, illumination: np.ndarray, dx: float, dy: 
         out[c] = ((1.0 - mix) * light.horizon[c] + mix * light.zenith[c]) * max(cloud, 0.05)
 
 
-@scalar
+@rowwise
 def _lit(depth: np.ndarray, illumination: np.ndarray, px: float, py: float, pz: float) -> float:
     """Share of the light's four nearest shadow-map rays that reach the world point."""
     light = illumination[0]
@@ -152,13 +156,18 @@ def find_edges(hit: np.ndarray, inverse_depth: np.ndarray, surface: np.ndarray, 
                 y, x = row + down, column + right
                 if y < height and x < width and hit[y, x] != here:
                     there, other = hit[y, x], inverse_depth[y, x]
-                    if here < 0 or there < 0 or surface[here] != surface[there] or abs(near - other) > 0.1 * max(near, other):
+                    if (
+                        here < 0
+                        or there < 0
+                        or surface[here] != surface[there]
+                        or abs(near - other) > 0.1 * max(near, other)
+                    ):
                         edge[row, column] = edge[y, x] = True
 
 
 @rowwise
 def merge_rays(hit: np.ndarray, surface: np.ndarray, count: int, weight: np.ndarray) -> None:
-    """Of each pixel's `count` consecutive rays keep the first on every surface; `weight` (R,) becomes its share of the pixel."""
+    """Of each pixel's `count` consecutive rays keep the first on every surface, with its share of the pixel."""
     for first in range(0, hit.size, count):
         for k in range(first, first + count):
             own = surface[hit[k]] if hit[k] >= 0 else -1
@@ -245,8 +254,14 @@ def shade(
         q00, q01, q10, q11, q20, q21 = uv[n, 0, 0], uv[n, 0, 1], uv[n, 1, 0], uv[n, 1, 1], uv[n, 2, 0], uv[n, 2, 1]
         u, v = t0 * q00 + t1 * q10 + t2 * q20, t0 * q01 + t1 * q11 + t2 * q21
         wx, wy = p00 + p10 + p20, p01 + p11 + p21
-        ux, uy = (p00 * q00 + p10 * q10 + p20 * q20 - u * wx) * inverse, (p01 * q00 + p11 * q10 + p21 * q20 - u * wy) * inverse
-        vx, vy = (p00 * q01 + p10 * q11 + p20 * q21 - v * wx) * inverse, (p01 * q01 + p11 * q11 + p21 * q21 - v * wy) * inverse
+        ux, uy = (
+            (p00 * q00 + p10 * q10 + p20 * q20 - u * wx) * inverse,
+            (p01 * q00 + p11 * q10 + p21 * q20 - u * wy) * inverse,
+        )
+        vx, vy = (
+            (p00 * q01 + p10 * q11 + p20 * q21 - v * wx) * inverse,
+            (p01 * q01 + p11 * q11 + p21 * q21 - v * wy) * inverse,
+        )
         across, down = math.sqrt(ux * ux + vx * vx), math.sqrt(uy * uy + vy * vy)
         major, minor = max(across, down), min(across, down)
 
@@ -255,7 +270,7 @@ def shade(
         a = material.uv
         tu, tv = a[0, 0] * u + a[0, 1] * v + a[0, 2], a[1, 0] * u + a[1, 1] * v + a[1, 2]
         stretch = math.sqrt(a[0, 0] * a[0, 0] + a[1, 0] * a[1, 0])
-        taps = 1 if major < 1.6 * minor else (2 if major < 4.0 * minor else 4)
+        taps = 1 if major < 2.0 * minor else (2 if major < 5.0 * minor else 3)
         texels = _SHARPNESS * max(major / taps, minor) * stretch * texture.size
         du, dv = (ux, vx) if across >= down else (uy, vy)
         step_u, step_v = a[0, 0] * du + a[0, 1] * dv, a[1, 0] * du + a[1, 1] * dv
@@ -274,7 +289,9 @@ def shade(
             fade = min(1.0, 2.0 - texels / 64.0)  # far away the fine texture is below the pixel
             if fade > 0.0:
                 work[0] = work[1] = work[2] = 0.0
-                _texture(atlas, texture.start, texture.size, texture.mirrored, u * fine, v * fine, texels, True, 1.0, work)
+                _texture(
+                    atlas, texture.start, texture.size, texture.mirrored, u * fine, v * fine, texels, False, 1.0, work
+                )
                 grain = max(1.0 + fade * material.detail_strength * (2.0 * work[1] - 1.0), 0.0)
 
         # light

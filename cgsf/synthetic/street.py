@@ -1,7 +1,7 @@
 """The family `street`: a car drives through a street, as in KITTI.
 
-The road runs along +z at y = 0; the camera is `camera height` above it and looks along the road, more or less. Beside it
-come pavements or verges, parked cars, furniture, trees, and house fronts; vehicles and people move on their own.
+The road runs along +z at y = 0; the camera is `camera height` above it and looks along the road, more or less. Beside
+it come pavements or verges, parked cars, furniture, trees, and house fronts; vehicles and people move on their own.
 """
 
 from collections.abc import Iterator
@@ -14,7 +14,7 @@ from cgsf.synthetic.meshes import box, boxes, hull, join, polygon
 from cgsf.synthetic.patterns import color
 from cgsf.synthetic.props import Placement
 from cgsf.synthetic.scene import CameraPath, Light, Material, Scene, Sky
-from cgsf.synthetic.textures import TextureSource, procedural
+from cgsf.synthetic.textures import TextureSource
 from variational.camera import StereoCamera
 
 _FAR_M = 180.0
@@ -28,11 +28,16 @@ def street(rng: np.random.Generator, source: TextureSource, height: int, width: 
     lane = rng.uniform(0.2, 0.75) * half_road
     eye = np.array([lane if rng.random() < 0.85 else -lane, -rng.uniform(1.45, 1.85), 0.0])
     turning = rng.random() < 0.3
-    speed = float(rng.choice([0.0, rng.uniform(0.05, 0.4), rng.uniform(0.3, 1.1), rng.uniform(0.9, 1.7)], p=[0.08, 0.25, 0.5, 0.17]))
+    speed = float(
+        rng.choice(
+            [0.0, rng.uniform(0.05, 0.4), rng.uniform(0.3, 1.1), rng.uniform(0.9, 1.7)], p=[0.08, 0.25, 0.5, 0.17]
+        )
+    )
     yaw_rate = rng.normal(0, 0.025) if turning else rng.normal(0, 0.004)
     heading = rng.normal(0, 0.25) if turning else rng.normal(0, 0.05)
     path = CameraPath(
-        eye, np.array([rng.normal(0, 0.012), heading, rng.normal(0, 0.01)]), np.array([0.0, rng.normal(0, 0.006), speed]),
+        eye, np.array([rng.normal(0, 0.012), heading, rng.normal(0, 0.01)]),
+        np.array([0.0, rng.normal(0, 0.006), speed]),
         np.array([rng.normal(0, 0.0025), yaw_rate, rng.normal(0, 0.0015)]),
     )  # fmt: skip
     scene = Scene(camera, path, *_daylight(rng, source))
@@ -68,8 +73,10 @@ def _daylight(rng: np.random.Generator, source: TextureSource) -> tuple[Light, S
         horizon, zenith = np.full(3, rng.uniform(0.8, 1.5)), np.full(3, rng.uniform(0.6, 1.2))
     else:
         horizon, zenith = blue * rng.uniform(0.8, 1.6), blue**2 * rng.uniform(0.3, 1.0)
-    light = Light(target + 300 * direction, target, 34.0, sun, np.inf, blue * ambient, np.full(3, ambient * rng.uniform(0.3, 0.6)))
-    clouds = procedural("clouds", int(rng.integers(24))) if rng.random() < 0.8 else source.kind("marble")
+    light = Light(
+        target + 300 * direction, target, 34.0, sun, np.inf, blue * ambient, np.full(3, ambient * rng.uniform(0.3, 0.6))
+    )
+    clouds = source.kind("clouds") if rng.random() < 0.8 else source.kind("marble")
     haze = float(np.exp(rng.uniform(np.log(3e-4), np.log(6e-3))))
     return light, Sky(horizon, zenith, clouds, rng.uniform(0.0, 0.8), haze)
 
@@ -78,29 +85,47 @@ def _flat(x0: float, x1: float, z0: float, z1: float, y: float = 0.0) -> np.ndar
     return np.array([(x0, y, z0), (x1, y, z0), (x1, y, z1), (x0, y, z1)])
 
 
-def _ground(scene: Scene, rng: np.random.Generator, source: TextureSource, half_road: float, pavement: float, urban: bool) -> None:
+def _ground(
+    scene: Scene, rng: np.random.Generator, source: TextureSource, half_road: float, pavement: float, urban: bool
+) -> None:
     """Road with its marks, repairs and covers, kerbs, pavements or verges, and what lies behind."""
     asphalt = Material(
-        source.kind("grain"), tinted(np.full(3, rng.uniform(0.25, 0.65)) * rng.uniform(0.95, 1.05, 3), rng.uniform(0.3, 0.9)), 1 / rng.uniform(3, 9),
-        rng.uniform(0, 6), detail=procedural("grain", int(rng.integers(24))), detail_scale=rng.uniform(0.8, 2.0),
-        detail_strength=rng.uniform(0.2, 0.7), specular=rng.choice([0.0, 0.15]), shininess=10.0,
-    )  # fmt: skip
+        source.kind("grain"),
+        tinted(np.full(3, rng.uniform(0.25, 0.65)) * rng.uniform(0.95, 1.05, 3), rng.uniform(0.3, 0.9)),
+        scale=1 / rng.uniform(3, 9),
+        turn=rng.uniform(0, 6),
+        detail=source.kind("grain"),
+        detail_scale=rng.uniform(0.8, 2.0),
+        detail_strength=rng.uniform(0.2, 0.7),
+        specular=float(rng.choice([0.0, 0.15])),
+        shininess=10.0,
+    )
     if urban and rng.random() < 0.12:
         asphalt = upright(source, rng.uniform(1.0, 2.5), "cells", "masonry")
     near = -12.0
     scene.add(polygon(_flat(-half_road, half_road, near, _FAR_M)), asphalt)
-    walk = upright(source, rng.uniform(0.8, 2.5), "masonry", "cells", "grain") if urban else upright(source, rng.uniform(1.5, 3.0), "foliage", recolor=False)
-    behind = upright(source, rng.uniform(1.5, 4.0), *(("grain", "masonry", "foliage") if urban else ("foliage",)), recolor=urban)
+    walk = (
+        upright(source, rng.uniform(0.8, 2.5), "masonry", "cells", "grain")
+        if urban
+        else upright(source, rng.uniform(1.5, 3.0), "foliage", recolor=False)
+    )
+    behind = upright(
+        source, rng.uniform(1.5, 4.0), *(("grain", "masonry", "foliage") if urban else ("foliage",)), recolor=urban
+    )
     stone, step = paint(rng, np.full(3, rng.uniform(0.35, 0.75))), rng.uniform(0.06, 0.16) if urban else 0.02
     for side in (-1, 1):
         inner, outer = side * (half_road + 0.15), side * (half_road + pavement)
         scene.add(polygon(_flat(inner, outer, near, _FAR_M, -step)), walk)
-        scene.add(box((0.15, 2 * step, _FAR_M - near)).moved((side * (half_road + 0.075), 0, (_FAR_M + near) / 2)), stone)
+        scene.add(
+            box((0.15, 2 * step, _FAR_M - near)).moved((side * (half_road + 0.075), 0, (_FAR_M + near) / 2)), stone
+        )
         scene.add(polygon(_flat(outer, side * 90, near, _FAR_M, -step)), behind)
     white = paint(rng, np.full(3, rng.uniform(0.6, 0.95)))
     if rng.random() < 0.7:
         dash, gap = (rng.uniform(1.5, 6), rng.uniform(2, 8)) if rng.random() < 0.75 else (_FAR_M, 1.0)
-        dashes = [polygon(_flat(-0.07, 0.07, z, min(z + dash, _FAR_M), -0.004)) for z in np.arange(near, 90, dash + gap)[:24]]
+        dashes = [
+            polygon(_flat(-0.07, 0.07, z, min(z + dash, _FAR_M), -0.004)) for z in np.arange(near, 90, dash + gap)[:24]
+        ]
         scene.add(join(dashes), white)
     if rng.random() < 0.4:
         for side in (-1, 1):
@@ -111,9 +136,21 @@ def _ground(scene: Scene, rng: np.random.Generator, source: TextureSource, half_
         bars = [polygon(_flat(x, x + 0.5, z, z + 3, -0.004)) for x in np.arange(-half_road + 0.4, half_road - 0.5, 1.0)]
         scene.add(join(bars), white)
     for _ in range(int(rng.integers(0, 8))):  # repairs and covers
-        x, z, w, depth = rng.uniform(-half_road, half_road - 1), rng.uniform(3, 30), rng.uniform(0.4, 2.5), rng.uniform(0.5, 6)
+        x, z, w, depth = (
+            rng.uniform(-half_road, half_road - 1),
+            rng.uniform(3, 30),
+            rng.uniform(0.4, 2.5),
+            rng.uniform(0.5, 6),
+        )
         shade = tinted(np.full(3, rng.uniform(0.15, 0.6)), 0.6)
-        patch = Material(source.kind("grain", "cells", "checks", "rust"), shade, rng.uniform(0.3, 1.5), detail=asphalt.detail, detail_scale=1.5, detail_strength=0.4)
+        patch = Material(
+            source.kind("grain", "cells", "checks", "rust"),
+            shade,
+            rng.uniform(0.3, 1.5),
+            detail=asphalt.detail,
+            detail_scale=1.5,
+            detail_strength=0.4,
+        )
         scene.add(polygon(_flat(x, min(x + w, half_road), z, z + depth, -0.003)), patch)
 
 
@@ -123,14 +160,26 @@ def _houses(scene: Scene, rng: np.random.Generator, source: TextureSource, side:
     terrace = rng.random() < 0.5
     while z < 110:
         length, floors, storey = rng.uniform(7, 22), int(rng.integers(1, 6)), rng.uniform(2.7, 3.6)
-        tall, depth, back = floors * storey + rng.uniform(0.2, 1.5), rng.uniform(6, 12), rng.uniform(0, 2.5) * (not terrace)
+        tall, depth, back = (
+            floors * storey + rng.uniform(0.2, 1.5),
+            rng.uniform(6, 12),
+            rng.uniform(0, 2.5) * (not terrace),
+        )
         x = side * (front + back)
         facade = Material(
-            source.any("facade") if rng.random() < 0.5 else source.kind("facade"), np.eye(3, 4) * rng.uniform(0.6, 1.15, (3, 1)) ** 0.5,
-            1 / (storey * rng.integers(1, 4)), 0.0, (rng.random(), 0.0), source.kind("grain", "masonry", "clouds"), 1 / rng.uniform(0.5, 2), rng.uniform(0, 0.5),
-        )  # fmt: skip
+            source.any("facade") if rng.random() < 0.5 else source.kind("facade"),
+            np.eye(3, 4) * rng.uniform(0.6, 1.15, (3, 1)) ** 0.5,
+            scale=1 / (storey * rng.integers(1, 4)),
+            offset=(rng.random(), 0.0),
+            detail=source.kind("grain", "masonry", "clouds"),
+            detail_scale=1 / rng.uniform(0.5, 2),
+            detail_strength=rng.uniform(0, 0.5),
+        )
         wall = upright(source, rng.uniform(2, 5), "masonry", "grain", "rust", "plain")
-        scene.add(box((depth, tall, length)).moved((x + side * depth / 2, -tall / 2, z + length / 2)), facade if rng.random() < 0.8 else wall)
+        scene.add(
+            box((depth, tall, length)).moved((x + side * depth / 2, -tall / 2, z + length / 2)),
+            facade if rng.random() < 0.8 else wall,
+        )
         trim = paint(rng, color(rng, 0.2))
         if rng.random() < 0.6:
             _windows(scene, rng, side, x, (z, length, floors, storey), trim)
@@ -139,18 +188,40 @@ def _houses(scene: Scene, rng: np.random.Generator, source: TextureSource, side:
                 scene.add(box((0.3, 0.18, length)).moved((x, -floor * storey, z + length / 2)), trim)
         if rng.random() < 0.5:
             ridge = rng.uniform(1.5, 4)
-            corners = [(x - side * 0.4, -tall, z), (x - side * 0.4, -tall, z + length), (x + side * depth, -tall, z), (x + side * depth, -tall, z + length)]
-            corners += [(x + side * depth / 2, -tall - ridge, z + 0.3), (x + side * depth / 2, -tall - ridge, z + length - 0.3)]
+            corners = [
+                (x - side * 0.4, -tall, z),
+                (x - side * 0.4, -tall, z + length),
+                (x + side * depth, -tall, z),
+                (x + side * depth, -tall, z + length),
+            ]
+            corners += [
+                (x + side * depth / 2, -tall - ridge, z + 0.3),
+                (x + side * depth / 2, -tall - ridge, z + length - 0.3),
+            ]
             scene.add(hull(np.array(corners)), upright(source, 2.0, "masonry", "stripes", "cells"))
         if rng.random() < 0.35:  # shop sign or awning
             w = rng.uniform(1.5, 5)
-            board = Material(source.any("text", "stripes"), np.eye(3, 4), 1 / rng.uniform(1, 3), 0.0, tuple(rng.random(2)), glow=rng.choice([0, 0.3]))
-            scene.add(box((rng.uniform(0.1, 1.2), rng.uniform(0.4, 1.0), w)).moved((x - side * 0.3, -rng.uniform(2.4, 3.2), z + length * rng.uniform(0.3, 0.7))), board)
+            board = Material(
+                source.any("text", "stripes"),
+                np.eye(3, 4),
+                1 / rng.uniform(1, 3),
+                0.0,
+                tuple(rng.random(2)),
+                glow=rng.choice([0, 0.3]),
+            )
+            scene.add(
+                box((rng.uniform(0.1, 1.2), rng.uniform(0.4, 1.0), w)).moved(
+                    (x - side * 0.3, -rng.uniform(2.4, 3.2), z + length * rng.uniform(0.3, 0.7))
+                ),
+                board,
+            )
         z += length + (0.0 if terrace and rng.random() < 0.8 else rng.uniform(1, 9))
 
 
-def _windows(scene: Scene, rng: np.random.Generator, side: int, x: float, house: tuple[float, float, int, float], trim: Material) -> None:
-    """Windows and balconies that stand out from the wall or lie in it; `house` is z, length, floors and storey height."""
+def _windows(
+    scene: Scene, rng: np.random.Generator, side: int, x: float, house: tuple[float, float, int, float], trim: Material
+) -> None:
+    """Windows and balconies on a wall; `house` is its z, length, floors and height of a floor."""
     z, length, floors, storey = house
     bay = rng.uniform(1.2, 3.5)
     glass = paint(rng, np.full(3, rng.uniform(0.03, 0.2)), 0.5, rng.uniform(0.3, 1.0))
@@ -167,7 +238,9 @@ def _windows(scene: Scene, rng: np.random.Generator, side: int, x: float, house:
         scene.add(boxes((0.06, 0.9, wide + 0.6), upper + (-side * 0.95, tall / 2 - 0.25, 0)), trim)
 
 
-def _green(scene: Scene, rng: np.random.Generator, source: TextureSource, side: int, front: float, wardrobe: Wardrobe) -> None:
+def _green(
+    scene: Scene, rng: np.random.Generator, source: TextureSource, side: int, front: float, wardrobe: Wardrobe
+) -> None:
     """Trees, hedges and banks in place of houses."""
     for z in np.arange(rng.uniform(2, 8), 80, rng.uniform(6, 14))[:9]:
         foot = (side * (front + rng.uniform(0, 8)), 0.0, z + rng.normal(0, 1.5))
@@ -180,7 +253,13 @@ def _green(scene: Scene, rng: np.random.Generator, source: TextureSource, side: 
 
 
 def _roadside(
-    scene: Scene, rng: np.random.Generator, side: int, half_road: float, pavement: float, wardrobe: Wardrobe, urban: bool
+    scene: Scene,
+    rng: np.random.Generator,
+    side: int,
+    half_road: float,
+    pavement: float,
+    wardrobe: Wardrobe,
+    urban: bool,
 ) -> None:
     """Parked cars, trees, poles, signs, fences, bins along one side."""
     if rng.random() < (0.65 if urban else 0.2):
@@ -195,7 +274,12 @@ def _roadside(
     if rng.random() < 0.45:
         for z in np.arange(rng.uniform(4, 12), 60, rng.uniform(8, 16))[:6]:
             Placement((middle, 0.0, z), rng.uniform(0, 6)).put(scene, props.tree(rng), wardrobe.roadside())
-    for shape, chance, spacing in ((props.lamp_post, 0.7, 22.0), (props.sign, 0.7, 14.0), (props.small, 0.6, 8.0), (props.bush, 0.4, 7.0)):
+    for shape, chance, spacing in (
+        (props.lamp_post, 0.7, 22.0),
+        (props.sign, 0.7, 14.0),
+        (props.small, 0.6, 8.0),
+        (props.bush, 0.4, 7.0),
+    ):
         if rng.random() < chance:
             for z in np.arange(rng.uniform(2, spacing), 55, spacing * rng.uniform(0.6, 1.4))[:7]:
                 x = middle + side * rng.uniform(0, max(pavement - 0.8, 0.1)) * (shape is not props.lamp_post)
@@ -214,7 +298,20 @@ def _horizon(scene: Scene, rng: np.random.Generator, source: TextureSource) -> N
         if rng.random() < 0.5:
             scene.add(box((w, tall, 8)).moved((x, -tall / 2, z)), material)
         else:
-            scene.add(hull(np.array([(x - w, 1, z), (x + w, 1, z), (x, 1, z + 20), (x - 0.4 * w, -tall, z + 8), (x + 0.3 * w, -tall * 0.8, z + 8)])), material)
+            scene.add(
+                hull(
+                    np.array(
+                        [
+                            (x - w, 1, z),
+                            (x + w, 1, z),
+                            (x, 1, z + 20),
+                            (x - 0.4 * w, -tall, z + 8),
+                            (x + 0.3 * w, -tall * 0.8, z + 8),
+                        ]
+                    )
+                ),
+                material,
+            )
 
 
 def _traffic(scene: Scene, rng: np.random.Generator, wardrobe: Wardrobe, lane: float, ids: Iterator[int]) -> None:
@@ -235,7 +332,9 @@ def _traffic(scene: Scene, rng: np.random.Generator, wardrobe: Wardrobe, lane: f
         z += rng.uniform(8, 30)
     if rng.random() < 0.35:  # crossing
         way = int(rng.choice([-1, 1]))
-        add(-way * rng.uniform(-3, 6), rng.uniform(9, 30), way * (np.pi / 2 + rng.normal(0, 0.2)), rng.uniform(0.2, 1.0))
+        add(
+            -way * rng.uniform(-3, 6), rng.uniform(9, 30), way * (np.pi / 2 + rng.normal(0, 0.2)), rng.uniform(0.2, 1.0)
+        )
 
 
 def _people(

@@ -5,7 +5,7 @@ procedural ones come from a bank: (kind, variant) names one texture for good, ma
 """
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 
 import cv2
@@ -55,7 +55,7 @@ class Texture:
         return cls(texels[:, 0] | texels[:, 1] << 8 | texels[:, 2] << 16, size, mirrored)
 
 
-@lru_cache(maxsize=None)
+@cache
 def procedural(kind: str, variant: int) -> Texture:
     """Texture `variant` (0 ... VARIANTS - 1) of `kind`, a key of `patterns.KINDS`."""
     rng = np.random.default_rng([_SEED, sorted(patterns.KINDS).index(kind), variant])

@@ -11,7 +11,7 @@ from cgsf.synthetic.scene import CameraPath, Light, Motion, Scene, Sky
 from cgsf.synthetic.textures import TextureSource
 from variational.camera import StereoCamera
 
-# --- shapes of about unit radius -------------------------------------------------------------------------------------
+# --- shapes of about unit radius ------------------------------------------------------------------------------------
 
 
 def _box(rng: np.random.Generator) -> Mesh:
@@ -46,7 +46,10 @@ def _blob(rng: np.random.Generator) -> Mesh:
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     frequency = rng.uniform(2, 9, count)
     return ellipsoid(
-        rng.uniform(0.5, 0.9, 3), 20, 32, bumps=np.column_stack([directions, frequency, rng.uniform(0.1, 0.5, count) / frequency**0.6])
+        rng.uniform(0.5, 0.9, 3),
+        20,
+        32,
+        bumps=np.column_stack([directions, frequency, rng.uniform(0.1, 0.5, count) / frequency**0.6]),
     )
 
 
@@ -58,7 +61,9 @@ def _vase(rng: np.random.Generator) -> Mesh:
 
 def _drum(rng: np.random.Generator) -> Mesh:
     radius = rng.uniform(0.15, 0.8)
-    return lathe(np.array([[radius, -0.8], [radius * rng.choice([1, 1, 0.02, 0.5]), 0.8]]) * (1, rng.uniform(0.15, 1)), 24)
+    return lathe(
+        np.array([[radius, -0.8], [radius * rng.choice([1, 1, 0.02, 0.5]), 0.8]]) * (1, rng.uniform(0.15, 1)), 24
+    )
 
 
 def _ring(rng: np.random.Generator) -> Mesh:
@@ -101,7 +106,12 @@ def _lattice(rng: np.random.Generator) -> Mesh:
 
 def _seat(rng: np.random.Generator) -> Mesh:
     """A chair or a table: a plate on four legs, with or without a back."""
-    width, depth, height, leg = rng.uniform(0.7, 1.2), rng.uniform(0.7, 1.2), rng.uniform(0.5, 1.0), rng.uniform(0.03, 0.08)
+    width, depth, height, leg = (
+        rng.uniform(0.7, 1.2),
+        rng.uniform(0.7, 1.2),
+        rng.uniform(0.5, 1.0),
+        rng.uniform(0.03, 0.08),
+    )
     parts = [box((width, 0.08, depth))]
     for x in (-1, 1):
         for z in (-1, 1):
@@ -116,7 +126,9 @@ def _seat(rng: np.random.Generator) -> Mesh:
 def _cloth(rng: np.random.Generator) -> Mesh:
     """A waved sheet, seen from both sides."""
     a, b = np.meshgrid(np.linspace(-0.9, 0.9, 21), np.linspace(-0.9, 0.9, 21), indexing="ij")
-    depth = sum(0.25 / k * np.sin(k * (a * rng.normal() + b * rng.normal()) * 3 + rng.uniform(0, 6)) for k in range(1, 4))
+    depth: np.ndarray | float = sum(
+        0.25 / k * np.sin(k * (a * rng.normal() + b * rng.normal()) * 3 + rng.uniform(0, 6)) for k in range(1, 4)
+    )
     return grid(np.stack([a, b, np.asarray(depth)], -1), np.stack([a, b], -1))
 
 
@@ -136,8 +148,8 @@ def _letters(rng: np.random.Generator) -> Mesh:
 
 
 SHAPES: tuple[tuple[float, Callable[[np.random.Generator], Mesh]], ...] = (
-    (3, _box), (1.5, _plate), (2, _stone), (1.5, _wedge), (1.5, _ball), (1.5, _pebble), (2.5, _blob), (1.5, _vase), (2, _drum),
-    (1, _ring), (1, _gear), (1, _knot), (0.8, _frame), (0.6, _lattice), (1.5, _seat), (1, _cloth), (0.8, _letters),
+    (3, _box), (1.5, _plate), (2, _stone), (1.5, _wedge), (1.5, _ball), (1.5, _pebble), (2.5, _blob), (1.5, _vase),
+    (2, _drum), (1, _ring), (1, _gear), (1, _knot), (0.8, _frame), (0.6, _lattice), (1.5, _seat), (1, _cloth), (0.8, _letters),
 )  # fmt: skip
 _WEIGHTS = np.array([weight for weight, _ in SHAPES])
 
@@ -147,7 +159,7 @@ def shape(rng: np.random.Generator, flat: bool = False) -> Mesh:
     return SHAPES[int(rng.choice(len(SHAPES), p=_WEIGHTS / _WEIGHTS.sum()))][1](rng)
 
 
-# --- the scene -------------------------------------------------------------------------------------------------------
+# --- the scene ------------------------------------------------------------------------------------------------------
 
 
 def _size(rng: np.random.Generator, middle: float, spread: float, largest: float) -> float:
@@ -178,7 +190,9 @@ def things(rng: np.random.Generator, source: TextureSource, height: int, width: 
         np.array([0, 0, 0.6 * back_m]), 0.75 * back_m, tint * bright, back_m * rng.uniform(0.6, 2.0),
         tint * rng.uniform(0.15, 0.7), tint * rng.uniform(0.1, 0.5),
     )  # fmt: skip
-    sky = Sky(tint * rng.uniform(0.3, 1.2), tint[::-1] * rng.uniform(0.2, 1.0), source.any("clouds"), rng.uniform(0.2, 1.0))
+    sky = Sky(
+        tint * rng.uniform(0.3, 1.2), tint[::-1] * rng.uniform(0.2, 1.0), source.any("clouds"), rng.uniform(0.2, 1.0)
+    )
     scene = Scene(camera, path, light, sky)
     _room(scene, rng, source, back_m, focal, aspect)
 
@@ -200,7 +214,9 @@ def things(rng: np.random.Generator, source: TextureSource, height: int, width: 
     return scene
 
 
-def _room(scene: Scene, rng: np.random.Generator, source: TextureSource, back_m: float, focal: float, aspect: float) -> None:
+def _room(
+    scene: Scene, rng: np.random.Generator, source: TextureSource, back_m: float, focal: float, aspect: float
+) -> None:
     """Walls, floor and ceiling, turned against the camera, and things that stand on the floor."""
     turn = Rotation.from_rotvec(rng.uniform(-1, 1, 3) * (0.12, 0.5, 0.1))
     left, right = -rng.uniform(0.35, 0.9) * back_m / focal, rng.uniform(0.35, 0.9) * back_m / focal
@@ -228,6 +244,9 @@ def _room(scene: Scene, rng: np.random.Generator, source: TextureSource, back_m:
         scene.add(mesh.moved((0, 0, 0), yaw).moved(place).moved((0, 0, 0), turn), surface(source, size))
     for _ in range(int(rng.integers(0, 5))):  # pictures on the back wall
         w, h = rng.uniform(0.05, 0.2, 2) * back_m
-        x, y = rng.uniform(left + w, right - w) if right - left > 2 * w else 0.0, rng.uniform(0.7 * ceiling, 0.5 * floor)
+        x, y = (
+            rng.uniform(left + w, right - w) if right - left > 2 * w else 0.0,
+            rng.uniform(0.7 * ceiling, 0.5 * floor),
+        )
         corners = np.array([(x, y, 0), (x + w, y, 0), (x + w, y + h, 0), (x, y + h, 0)]) + (0, 0, 0.995 * back_m)
         scene.add(polygon(corners).moved((0, 0, 0), turn), surface(source, max(w, h)))

@@ -7,9 +7,9 @@ corners where another camera has them, at another time, is the same point there.
 from typing import NamedTuple
 
 import numpy as np
-from variational.jit import rowwise
 
 from cgsf.synthetic.caster import NEAR_M, Caster
+from variational.jit import rowwise
 
 
 class View(NamedTuple):
@@ -70,7 +70,9 @@ def follow(source: View, target: View) -> tuple[np.ndarray, np.ndarray]:
     place, there = np.empty((*source.hit.shape, 2)), np.empty(source.hit.shape)
     caster = source.caster
     turn = target.caster.pose[:3, :3] @ caster.pose[:3, :3].T
-    _follow(source.hit, source.inverse_depth, caster.plane, target.caster.corners, turn, caster.intrinsics, place, there)
+    _follow(
+        source.hit, source.inverse_depth, caster.plane, target.caster.corners, turn, caster.intrinsics, place, there
+    )
     return place, there
 
 

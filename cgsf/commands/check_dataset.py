@@ -1,0 +1,49 @@
+"""``cgsf check-dataset``: warp with the truth and report samples whose images do not fit."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+
+@click.command()
+@click.argument("name")
+@click.argument("root", type=click.Path(path_type=Path))
+@click.option("--limit", type=click.IntRange(1), help="Check at most so many samples, evenly spread.")
+@click.option(
+    "--option", "options", multiple=True, metavar="KEY=VALUE", help="Option of the data set, for example split=test."
+)
+def command(name: str, root: Path, limit: int | None, options: tuple[str, ...]) -> None:
+    """Check signs, units and pairing of data set NAME in ROOT: its truth must warp its images onto each other.
+
+    Exits with code 1 if a sample is suspect.
+    """
+    import numpy as np
+    from tqdm import tqdm
+
+    from cgsf.datasets import open_dataset
+    from cgsf.datasets.check import check_sample
+    from cgsf.errors import InputError
+
+    broken = [option for option in options if "=" not in option]
+    if broken:
+        raise InputError(f"--option takes KEY=VALUE, got {broken[0]!r}")
+    dataset = open_dataset(name, root, **dict(option.split("=", 1) for option in options))
+    chosen = np.unique(np.linspace(0, len(dataset) - 1, min(limit or len(dataset), len(dataset))).round().astype(int))
+    suspects, residuals = 0, dict[str, list[float]]()
+    for index in tqdm(chosen, unit="sample", disable=None):
+        findings = check_sample(dataset[int(index)])
+        for finding in findings:
+            residuals.setdefault(finding.quantity, []).append(finding.residual)
+        complaints = [finding.complaint for finding in findings if finding.complaint]
+        suspects += bool(complaints)
+        for complaint in complaints:
+            click.echo(f"{dataset.names[int(index)]}: {complaint}")
+    for quantity, values in residuals.items():
+        click.echo(f"{quantity}: median residual {np.nanmedian(values):.4f} over {len(values)} samples")
+    if not residuals:
+        click.echo("no truth to check")
+    click.echo(f"{len(chosen)} samples checked, {suspects} suspect")
+    if suspects:
+        raise SystemExit(1)

@@ -1,0 +1,97 @@
+"""Rendered stereo video with exact truth as data sets: nothing is read from disk, so `root` is not looked at.
+
+``synthetic-things`` and ``synthetic-street`` render any number of samples on the fly; the options of
+`cgsf.synthetic.RenderConfig` are accepted. ``synthetic-v1`` is frozen, so that results stay comparable: 20 samples of
+each family, seeds 1,000,000 to 1,000,019, `street` at 376 x 1242 and `things` at 384 x 640 pixels (height x width), no
+photographs, default options.
+"""
+
+from pathlib import Path
+from typing import Any
+
+from cgsf.datasets.sample import Sample
+from cgsf.errors import InputError
+from cgsf.synthetic import make_sample
+
+
+class Synthetic:
+    """Samples of one family of scenes.
+
+    Parameters
+    ----------
+    root : Path
+        Not used.
+    family : str
+    count : int
+        Number of samples.
+    seed : int
+        Seed of the first sample; the others follow.
+    height, width : int
+        Image size in pixels.
+    **options
+        Fields of `RenderConfig`.
+    """
+
+    def __init__(
+        self,
+        root: Path,
+        family: str,
+        count: int = 20,
+        seed: int = 0,
+        height: int = 376,
+        width: int = 1242,
+        **options: Any,
+    ) -> None:
+        if count < 1:
+            raise InputError(f"count must be at least 1, got {count}")
+        self.family, self.seeds, self.size, self.options = family, range(seed, seed + count), (height, width), options
+        self.names = [f"{family}-{number:06d}" for number in self.seeds]
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def __getitem__(self, index: int) -> Sample:
+        return make_sample(self.family, self.seeds[index], *self.size, **self.options)
+
+
+class Street(Synthetic):
+    """``synthetic-street``."""
+
+    def __init__(self, root: Path, **options: Any) -> None:
+        super().__init__(root, "street", **options)
+
+
+class Things(Synthetic):
+    """``synthetic-things``."""
+
+    def __init__(self, root: Path, **options: Any) -> None:
+        super().__init__(root, "things", **({"height": 384, "width": 640} | options))
+
+
+class SyntheticV1:
+    """``synthetic-v1``, the frozen test split.
+
+    Parameters
+    ----------
+    root : Path
+        Not used.
+    family : {"street", "things"}, optional
+        Only one half of it.
+    """
+
+    FIRST_SEED, COUNT = 1_000_000, 20
+
+    def __init__(self, root: Path, family: str | None = None) -> None:
+        halves = {"street": Street, "things": Things}
+        if family is not None and family not in halves:
+            raise InputError(f"unknown family {family!r}; synthetic-v1 has street and things")
+        chosen = [family] if family else ["street", "things"]
+        self._halves = [halves[name](root, count=self.COUNT, seed=self.FIRST_SEED) for name in chosen]
+        self.names = [name for half in self._halves for name in half.names]
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def __getitem__(self, index: int) -> Sample:
+        place = range(len(self))[index]
+        return self._halves[place // self.COUNT][place % self.COUNT]
