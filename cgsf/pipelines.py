@@ -65,6 +65,9 @@ METHODS: dict[str, Method] = {
     "opencv": _composition("dis", False),
     **{f"opencv-{flow}": _composition(flow, False) for flow in ("deepflow", "rlof", "farneback")},
     **{f"opencv-wls-{flow}": _composition(flow, True) for flow in ("dis", "deepflow", "rlof", "farneback")},
+    "feedforward": Method(
+        "cgsf.feedforward:run_networks", "the networks alone", "feedforward", "cgsf.feedforward:FeedforwardConfig",
+    ),
     "zero": Method("cgsf.baselines:nothing", "zero everywhere"),
 }  # fmt: skip
 
@@ -158,6 +161,15 @@ def load_config(method: str, preset: str = "default") -> Any:
     if entry.config is None or entry.section is None:
         return None
     return from_table(_load(entry.config), tables.get(entry.section, {}) | dict(entry.fixed), entry.section)
+
+
+def on_device(config: Any, device: str | None) -> Any:
+    """The settings with another device; `InputError` for a method that has none, as it runs on the CPU alone."""
+    if device is None:
+        return config
+    if not hasattr(config, "device"):
+        raise InputError("this method runs on the CPU alone: leave --device out, or take --method feedforward")
+    return replace(config, device=device)
 
 
 def consistency_loss(frames: Frames, result: SceneFlow) -> np.ndarray:

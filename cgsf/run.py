@@ -26,6 +26,7 @@ def run(
     preset: str = "default",
     calibration: str | Path | None = None,
     progress: pipelines.Progress | None = None,
+    device: str | None = None,
 ) -> SceneFlow:
     """Scene flow of four image files, with all its files.
 
@@ -41,6 +42,8 @@ def run(
     calibration : str or Path, optional
         A calibration file.
     progress : callable, optional
+    device : str, optional
+        For methods with networks: any device of torch, as cpu, cuda or mps.
 
     Returns
     -------
@@ -51,7 +54,7 @@ def run(
     InputError
         For whatever cannot be read, solved or written.
     """
-    config = pipelines.load_config(method, preset)
+    config = pipelines.on_device(pipelines.load_config(method, preset), device)
     with all_or_nothing(out) as folder:
         start = time.perf_counter()
         camera = None if calibration is None else Calibration.read(calibration)

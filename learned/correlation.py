@@ -1,8 +1,8 @@
 """Correlation of two feature maps: the cost volumes of motion (in two dimensions) and of disparity (in one).
 
 ``correlation(a, b, r)[k](x, y) = mean_c a_c(x, y) b_c(x + dx, y + dy)`` with ``k = (dy + r) (2r + 1) + dx + r``;
-``disparity_correlation(a, b, D, G)[g, d](x, y) = sum_{c in g} a_c(x, y) b_c(x - d, y)`` of unit vectors. Features outside
-the image count as zero. On the CPU numba kernels run forward and backward; anywhere else the plain torch versions.
+``disparity_correlation(a, b, D, G)[g, d](x, y) = sum_{c in g} a_c(x, y) b_c(x - d, y)`` of unit vectors. Features
+outside the image count as zero. On the CPU numba kernels run forward and backward; anywhere else the torch versions.
 """
 
 from __future__ import annotations
@@ -66,12 +66,14 @@ def disparity_correlation(left: Tensor, right: Tensor, disparities: int, groups:
     Guo et al., Group-wise Correlation Stereo Network, CVPR 2019 (there without normalisation).
     """
     if left.shape != right.shape or left.shape[1] % groups:
-        raise ValueError(f"cannot correlate {tuple(left.shape)} with {tuple(right.shape)} in {groups} groups of channels")
-    unit = [F.normalize(side.float().unflatten(1, (groups, -1)), dim=2) for side in (left, right)]
+        shapes = f"{tuple(left.shape)} with {tuple(right.shape)}"
+        raise ValueError(f"cannot correlate {shapes} in {groups} groups of channels")
+    unit_left, unit_right = (F.normalize(_at_least_float32(side).unflatten(1, (groups, -1)), dim=2)
+                             for side in (left, right))
     if left.device.type == "cpu" and left.dtype in (torch.float32, torch.bfloat16):
-        volume: Tensor = _DisparityCorrelation.apply(*unit, disparities)
+        volume: Tensor = _DisparityCorrelation.apply(unit_left, unit_right, disparities)
         return volume.to(left.dtype)
-    return disparity_correlation_reference(*unit, disparities).to(left.dtype)
+    return disparity_correlation_reference(unit_left, unit_right, disparities).to(left.dtype)
 
 
 def disparity_correlation_reference(left: Tensor, right: Tensor, disparities: int) -> Tensor:
@@ -92,7 +94,7 @@ class _Correlation(torch.autograd.Function):
         return out
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor | None, None]:  # type: ignore[override]
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor | None, None]:
         first, second = ctx.saved_tensors
         radius = ctx.radius
         to_first = to_second = None
@@ -106,6 +108,10 @@ class _Correlation(torch.autograd.Function):
             _mirror(_array(gradient), radius, mirrored)
             _backward(mirrored, _padded(first, radius), to_second.numpy())
         return to_first, to_second, None
+
+
+def _at_least_float32(tensor: Tensor) -> Tensor:
+    return tensor.to(torch.promote_types(tensor.dtype, torch.float32))
 
 
 def _array(tensor: Tensor) -> np.ndarray:
@@ -174,7 +180,7 @@ class _DisparityCorrelation(torch.autograd.Function):
         return out
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor, None]:  # type: ignore[override]
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor, None]:
         left, right = ctx.saved_tensors
         to_left, to_right = torch.zeros(left.shape), torch.zeros(right.shape)
         _disparity_backward(_array(left), _array(right), _array(gradient), to_left.numpy(), to_right.numpy())

@@ -85,7 +85,7 @@ class _SemiGlobal(torch.autograd.Function):
         return _volume(out, cost)
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor]:  # type: ignore[override]
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor]:
         planes, weights, chosen = ctx.saved_tensors
         to_planes, to_weights = torch.zeros_like(planes), torch.empty_like(weights)
         kernels.semi_global_backward(planes.numpy(), weights.numpy(), chosen.numpy(), _planes(gradient).numpy(),
@@ -163,7 +163,7 @@ class _Local(torch.autograd.Function):
         return out
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor]:  # type: ignore[override]
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor]:
         cost, weights = ctx.saved_tensors
         gradient = gradient.contiguous()
         to_cost, to_weights = torch.zeros_like(cost), torch.zeros_like(weights)

@@ -1,10 +1,9 @@
 """CPU kernels of ``learned.guided_aggregation``: float32, C-contiguous, forward and backward.
 
-Semi-global aggregation takes the channels innermost, and pixels and channels as one axis: costs (B, D, H * W * C). A task
-walks a bundle of neighbouring lines, whose channels side by side are the lanes of the vector registers; the costs of one
-step are gathered to (D, lanes), so that the four directions share the arithmetic. Volumes may be longer than H * W * C:
-planes whose distance is a multiple of 4096 bytes, as image sizes make them, collide in the cache and are walked at a
-third of the speed (:func:`padding`).
+Semi-global aggregation takes the channels innermost, and pixels and channels as one axis: costs (B, D, H * W * C). A
+task walks a bundle of neighbouring lines, whose channels side by side are the lanes of the vector registers; the costs
+of one step are gathered to (D, lanes), so that the four directions share the arithmetic. Planes have some unused values
+at their end (:func:`padding`): image sizes would set them a multiple of 4096 bytes apart, to collide in the cache.
 """
 
 from __future__ import annotations

@@ -5,6 +5,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from numba import njit, prange
 from numba.core.compiler import CompilerBase, DefaultPassBuilder
 
@@ -20,7 +22,7 @@ class _NoAlias(CompilerBase):
 
 
 # Reordering sums is fine; the absence of NaN and infinity is not assumed, so that bad values stay visible.
-_FLAGS = dict(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz", "arcp"})
+_FLAGS: dict[str, Any] = {"cache": True, "error_model": "numpy", "fastmath": {"contract", "reassoc", "nsz", "arcp"}}
 
 #: An inner loop over vector lanes. Its array arguments must not overlap, else LLVM could not vectorise it.
 lanes = njit(forceinline=True, pipeline_class=_NoAlias, **_FLAGS)

@@ -29,7 +29,7 @@ def multiscale_motion_loss(estimates: list[Tensor], truth: Tensor) -> Tensor:
     filled = torch.where(known, truth, 0) / MOTION_UNIT_PX
     loss = estimates[0].new_zeros(())
     for weight, estimate in zip(_LEVEL_WEIGHTS[-len(estimates) :], estimates, strict=True):
-        size = estimate.shape[-2:]
+        size = (estimate.shape[-2], estimate.shape[-1])
         share = F.adaptive_avg_pool2d(known.to(estimate.dtype), size)
         target = F.adaptive_avg_pool2d(filled, size) / share.clamp(min=1e-6)
         squared = torch.where(share > 0, estimate - target, 0).square().sum(1)

@@ -72,7 +72,8 @@ class PWCNet(nn.Module):
             self.pyramid.append(nn.Sequential(*steps))
             previous = channels
         self.decoders = nn.ModuleList(_Decoder(config, level) for level in self.levels)
-        dense = self.decoders[-1].channels
+        dense = (2 * config.radius + 1) ** 2 + config.pyramid[config.finest - 1] + config.outputs
+        dense += config.upsampled_features + sum(config.decoder)
         layers: list[nn.Module] = []
         for channels, dilation in config.context:
             layers.append(_convolution(dense, channels, dilation=dilation))
@@ -105,8 +106,10 @@ class PWCNet(nn.Module):
         cells = 2 ** len(self.config.pyramid)
         if first.shape[-2] % cells or first.shape[-1] % cells:
             raise ValueError(f"image sides must be multiples of {cells}, not {tuple(first.shape[-2:])}")
-        # both images as one batch: half as many, twice as large convolutions
-        pyramid = [features.chunk(2) for features in self._features(torch.cat([first, second]))]
+        # both images as one batch: half as many, twice as large convolutions;
+        # channels innermost: half as fast again on a CPU, four times as fast in bfloat16
+        images = torch.cat([first, second]).contiguous(memory_format=torch.channels_last)
+        pyramid = [features.chunk(2) for features in self._features(images)]
         motions: list[Tensor] = []
         coarser: tuple[Tensor, Tensor] | None = None
         for level, decoder in zip(self.levels, self.decoders, strict=True):
@@ -159,8 +162,7 @@ class _Decoder(nn.Module):
             upsampled, features = coarser
             costs = self._costs(first, warp(second, upsampled[:, :2] * self.pixels))
             dense = torch.cat([costs, first, upsampled.to(first.dtype), features], 1)
-        if first.is_contiguous(memory_format=torch.channels_last):
-            dense = dense.contiguous(memory_format=torch.channels_last)  # or every convolution would convert it again
+        dense = dense.contiguous(memory_format=torch.channels_last)  # or every convolution would convert it again
         for convolution in self.convolutions:
             dense = torch.cat([convolution(dense), dense], 1)
         if self.config.residual:
@@ -197,22 +199,4 @@ def _precise(module: nn.Module, features: Tensor) -> Tensor:
 
 
 def _at_least_float32(tensor: Tensor) -> Tensor:
-    return tensor.float() if tensor.dtype in (torch.bfloat16, torch.float16) else tensor
-
-
-def published_names(config: PWCNetConfig) -> dict[str, str]:
-    """This network's parameter names -> the names in the authors' checkpoints (their ``deconv2`` is never used)."""
-    names = {}
-    coarsest = len(config.pyramid)
-    for level in range(1, coarsest + 1):
-        suffixes = ("a", "aa", "b") if level < 6 else ("aa", "a", "b")
-        names |= {f"pyramid.{level - 1}.{i}.0": f"conv{level}{suffix}.0" for i, suffix in enumerate(suffixes)}
-        if level >= config.finest:
-            own = f"decoders.{coarsest - level}"
-            names |= {f"{own}.convolutions.{i}.0": f"conv{level}_{i}.0" for i in range(len(config.decoder))}
-            names[f"{own}.predict"] = f"predict_flow{level}"
-        if level > config.finest:
-            names |= {f"{own}.upsample_motion": f"deconv{level}", f"{own}.upsample_features": f"upfeat{level}"}
-    last = len(config.context)
-    names |= {f"context.{i}.0": f"dc_conv{i + 1}.0" for i in range(last)} | {f"context.{last}": f"dc_conv{last + 1}"}
-    return {f"{own}.{kind}": f"{theirs}.{kind}" for own, theirs in names.items() for kind in ("weight", "bias")}
+    return tensor.to(torch.promote_types(tensor.dtype, torch.float32))

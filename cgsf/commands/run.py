@@ -13,9 +13,11 @@ from cgsf.commands.options import method_option, preset_option, stage_bar
 @click.option("-o", "--output", required=True, metavar="OUT", help="Folder for the results; made if it is missing.")
 @method_option()
 @preset_option
+@click.option("--device", metavar="NAME", help="For networks: cpu, cuda, mps ...; the preset's unless given.")
 @click.option("--calibration", metavar="FILE", help="KITTI calibration, or JSON with fx fy cx cy baseline.")
 def command(
-    left1: str, right1: str, left2: str, right2: str, output: str, method: str, preset: str, calibration: str | None
+    left1: str, right1: str, left2: str, right2: str, output: str, method: str, preset: str, calibration: str | None,
+    device: str | None,
 ) -> None:
     """Scene flow of two rectified stereo pairs: LEFT1 RIGHT1 at time 1, LEFT2 RIGHT2 at time 2.
 
@@ -24,5 +26,5 @@ def command(
     from cgsf.run import run
 
     with stage_bar() as progress:
-        result = run((left1, right1, left2, right2), output, method, preset, calibration, progress)
+        result = run((left1, right1, left2, right2), output, method, preset, calibration, progress, device)
     click.echo(f"{output}: solved in {result.seconds['total']:.2f} s")

@@ -1,0 +1,98 @@
+"""The feedforward module: from four images to a first state, by any disparity network and any motion network."""
+
+from __future__ import annotations
+
+from contextlib import AbstractContextManager
+from itertools import pairwise
+from typing import Literal, Protocol
+
+import torch
+from torch import Tensor, nn
+from torch.nn.utils.fusion import fuse_conv_bn_eval
+
+Precision = Literal["float32", "bfloat16"]
+
+
+class DisparityNetwork(Protocol):
+    """Whatever maps (left, right), (B, 3, H, W) in [0, 1] BGR, to the left image's disparity (B, H, W) in pixels."""
+
+    def __call__(self, left: Tensor, right: Tensor) -> Tensor: ...
+
+
+class MotionNetwork(Protocol):
+    """Whatever maps (first, second) to (B, 3, H, W): u, v and the disparity change, in pixels, at first's pixels."""
+
+    def __call__(self, first: Tensor, second: Tensor) -> Tensor: ...
+
+
+class FeedforwardModule(nn.Module):
+    """Two disparity passes and two motion passes, joined to a state.
+
+    Parameters
+    ----------
+    disparity, motion : DisparityNetwork, MotionNetwork
+        ``GANet`` and ``PWCNet``, or any others that follow the protocol; modules are trained and moved along.
+    precision : "float32" or "bfloat16"
+        Of convolutions; coordinates, correlations, aggregation and the results stay in float32.
+    """
+
+    def __init__(self, disparity: DisparityNetwork, motion: MotionNetwork, precision: Precision = "float32") -> None:
+        super().__init__()
+        self.disparity, self.motion, self.precision = disparity, motion, precision
+
+    def forward(self, left1: Tensor, right1: Tensor, left2: Tensor, right2: Tensor) -> tuple[Tensor, Tensor]:
+        """State and backward flow, in pixels.
+
+        Parameters
+        ----------
+        left1, right1, left2, right2 : Tensor (B, 3, H, W)
+            In [0, 1], BGR.
+
+        Returns
+        -------
+        state : Tensor (B, 5, H, W)
+            D1, D2 (on left2's grid), C, u, v.
+        backward_flow : Tensor (B, 2, H, W)
+            left2 -> left1.
+        """
+        with self._mixed(left1.device):
+            d1, d2 = self.disparity(left1, right1), self.disparity(left2, right2)
+            forward, backward = self.motion(left1, left2), self.motion(left2, left1)
+        size = left1.shape[0], *left1.shape[2:]
+        if d1.shape != size or forward.shape != (size[0], 3, *size[1:]):
+            raise ValueError(f"networks must return disparity {size} and motion {(size[0], 3, *size[1:])}, "
+                             f"not {tuple(d1.shape)} and {tuple(forward.shape)}")
+        u, v, change = forward.unbind(1)
+        return torch.stack([d1, d2, change, u, v], 1), backward[:, :2]
+
+    def _mixed(self, device: torch.device) -> AbstractContextManager[None]:
+        return torch.autocast(device.type, torch.bfloat16, enabled=self.precision == "bfloat16")
+
+
+def fold_normalisation(net: nn.Module) -> nn.Module:
+    """Fold batch normalisation into the convolution before it, in place: the same results in evaluation, in less time.
+
+    The network must be in evaluation mode and cannot be trained afterwards.
+    """
+    if net.training:
+        raise ValueError("only a network in evaluation mode can be folded")
+    for module in net.modules():
+        layers = list(module.named_children()) if isinstance(module, nn.Sequential) else []
+        for (name, layer), (next_name, following) in pairwise(layers):
+            if isinstance(following, nn.BatchNorm2d | nn.BatchNorm3d):
+                transposed = isinstance(layer, nn.ConvTranspose2d | nn.ConvTranspose3d)
+                setattr(module, name, fuse_conv_bn_eval(layer, following, transposed))  # type: ignore[type-var]
+                setattr(module, next_name, nn.Identity())
+    return net
+
+
+def select_device(name: str) -> torch.device:
+    """The device of that name; a ValueError with one clear line if this machine or this torch does not have it."""
+    try:
+        device = torch.device(name)
+        torch.zeros(1, device=device).add_(1)
+    except (RuntimeError, AssertionError, NotImplementedError, ValueError):
+        accelerator = torch.accelerator.current_accelerator() if torch.accelerator.is_available() else None
+        have = "cpu" + (f", {accelerator.type}" if accelerator else "")
+        raise ValueError(f"device {name!r} is not available here; available: {have}") from None
+    return device
