@@ -112,7 +112,9 @@ def _seen(state: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return seen_in_right(state[D1]), project_visibility(state), seen_in_right(state[D2])
 
 
-def from_zero(frames: Frames, config: FromZeroConfig, constancy: ConstancyConfig, matching: MatchingConfig) -> tuple[Start, History]:
+def from_zero(
+    frames: Frames, config: FromZeroConfig, constancy: ConstancyConfig, matching: MatchingConfig
+) -> tuple[Start, History]:
     """Estimate everything from a zero state.
 
     Parameters
@@ -231,7 +233,8 @@ def descend_energy(
     for level in range(len(shapes) - 1, -1, -1):
         shape, images = shapes[level], frames_pyramid(frames, shapes[: level + 1])[level]
         sx, sy = shape[1] / frames.shape[1], shape[0] / frames.shape[0]
-        scaled = resize_maps(np.ascontiguousarray(backward.transpose(2, 0, 1)), shape) * np.float32([sx, sy])[:, None, None]
+        planes = resize_maps(np.ascontiguousarray(backward.transpose(2, 0, 1)), shape)
+        scaled = planes * np.array([sx, sy], np.float32)[:, None, None]
         oracle = Energy(images, energy, backward_flow=np.ascontiguousarray(scaled.transpose(1, 2, 0)))
 
         def value_and_gradient(x: np.ndarray, oracle: Energy = oracle) -> tuple[float, np.ndarray]:

@@ -16,8 +16,8 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from variational.census import popcount, stereo_costs
-from variational.jit import parallel, prange
+from variational.census import popcount, write_matching_costs
+from variational.jit import parallel, prange, scalar
 from variational.matching import MatchingConfig, StereoMatch, aggregate
 
 
@@ -44,11 +44,11 @@ class EvidenceConfig:
     anchor_per_px: float = 30.0
     hidden_cost: float = 60.0
     contradicted_cost: float = 90.0
-    time_weight: float = 1.5
+    time_weight: float = 2.0
     unknown_cost: float = 55.0
     background_per_px: float = 6.0
     background_most: float = 30.0
-    small_step: int = 60
+    small_step: int = 100
 
 
 @parallel
@@ -65,19 +65,40 @@ def _front(disparity: np.ndarray, matched: np.ndarray, front: np.ndarray) -> Non
                         front[y, to_x] = disparity[y, x]
 
 
+@scalar
+def _time_cost(
+    words_left1: np.ndarray, words_left2: np.ndarray, words_right2: np.ndarray, x: int, y: int, to_x: float,
+    to_y: float, to_disparity: float, unknown: np.float32,
+) -> np.float32:  # fmt: skip
+    """Differing bits at time 2, the mean of both cameras where both see the place."""
+    _, height, width = words_left1.shape
+    if not (0 <= to_x <= width - 1 and 0 <= to_y <= height - 1):
+        return unknown
+    i, j = int(to_x + 0.5), int(to_y + 0.5)
+    fine, wide = words_left1[0, y, x], words_left1[1, y, x]
+    bits = np.float32(popcount(fine ^ words_left2[0, j, i]) + popcount(wide ^ words_left2[1, j, i]))
+    i = int(np.rint(to_x - to_disparity))
+    if not 0 <= i < width:
+        return bits
+    return np.float32(0.5) * (bits + popcount(fine ^ words_right2[0, j, i]) + popcount(wide ^ words_right2[1, j, i]))
+
+
 @parallel
 def _write_costs(
-    costs: np.ndarray, disparity: np.ndarray, matched: np.ndarray, front: np.ndarray, words_left1: np.ndarray,
+    disparity: np.ndarray, matched: np.ndarray, front: np.ndarray, words_left1: np.ndarray, right1_mirrored: np.ndarray,
     words_left2: np.ndarray, words_right2: np.ndarray, labels: np.ndarray, homographies: np.ndarray, anchor: float,
-    hidden: float, contradicted: float, time_weight: float, unknown: float, pull: float, pull_most: float,
+    hidden: np.float32, contradicted: np.float32, time_weight: float, unknown: np.float32, pull: float,
+    pull_most: float, costs: np.ndarray,
 ) -> None:  # fmt: skip
     height, width, disparities = costs.shape
     for y in prange(height):
         for x in range(width):
+            row, known = costs[y, x], disparity[y, x]
             if matched[y, x]:
                 for d in range(disparities):
-                    costs[y, x, d] = np.uint8(min(abs(d - disparity[y, x]) * anchor, 255.0))
+                    row[d] = np.uint8(min(abs(np.float32(d) - known) * anchor, np.float32(255)))
                 continue
+            write_matching_costs(words_left1[:, y], right1_mirrored[:, y], x, row)
             label = labels[y, x]
             h = homographies[max(label, 0)]
             base0, base1, base2, base3 = (
@@ -85,29 +106,19 @@ def _write_costs(
                 h[2, 0] * x + h[2, 1] * y + h[2, 3], h[3, 0] * x + h[3, 1] * y + h[3, 3],
             )  # fmt: skip
             for d in range(disparities):
-                stereo: float = np.float32(costs[y, x, d])
-                if x >= d:
-                    seen = front[y, x - d]
-                    if seen >= 0 and d < seen - 1.5:
-                        stereo = hidden
-                    elif seen >= 0 and d > seen + 1.5:
-                        stereo = max(contradicted, stereo)
+                seen = front[y, x - d] if x >= d else np.float32(-1)
+                stereo = np.float32(row[d])
+                if seen >= 0:
+                    stereo = hidden if d < seen - 1.5 else max(contradicted, stereo) if d > seen + 1.5 else stereo
                 time = unknown
                 scale = base3 + h[3, 2] * d
                 if label >= 0 and scale > 0:
-                    to_x, to_y = (base0 + h[0, 2] * d) / scale, (base1 + h[1, 2] * d) / scale
-                    if 0 <= to_x <= width - 1 and 0 <= to_y <= height - 1:
-                        i, j = int(to_x + 0.5), int(to_y + 0.5)
-                        bits = popcount(words_left1[0, y, x] ^ words_left2[0, j, i])
-                        bits += popcount(words_left1[1, y, x] ^ words_left2[1, j, i])
-                        time = np.float32(bits)
-                        i = int(np.rint(to_x - (base2 + h[2, 2] * d) / scale))
-                        if 0 <= i < width:
-                            bits = popcount(words_left1[0, y, x] ^ words_right2[0, j, i])
-                            bits += popcount(words_left1[1, y, x] ^ words_right2[1, j, i])
-                            time = np.float32(0.5) * (time + bits)
-                background = min(abs(d - disparity[y, x]) * pull, pull_most)
-                costs[y, x, d] = np.uint8(min(stereo + time_weight * time + background, 255.0))
+                    time = _time_cost(
+                        words_left1, words_left2, words_right2, x, y, (base0 + h[0, 2] * d) / scale,
+                        (base1 + h[1, 2] * d) / scale, (base2 + h[2, 2] * d) / scale, unknown,
+                    )  # fmt: skip
+                background = min(abs(d - known) * pull, pull_most)
+                row[d] = np.uint8(min(stereo + time_weight * time + background, 255.0))
 
 
 def refill(
@@ -133,14 +144,14 @@ def refill(
         (H, W) float32, pixels; matched pixels keep their disparity but for a median over 5 x 5.
     """
     f = np.float32
-    costs = stereo_costs(match1.words_left, match1.words_right, match1.max_disparity + 1)
+    costs = np.empty((*grey.shape, match1.max_disparity + 1), np.uint8)
     front = np.empty(grey.shape, f)
     _front(match1.disparity, match1.matched, front)
     _write_costs(
-        costs, match1.disparity, match1.matched, front, match1.words_left, match2.words_left, match2.words_right,
-        labels.astype(np.int32), homographies.astype(f), f(config.anchor_per_px), f(config.hidden_cost),
-        f(config.contradicted_cost), f(config.time_weight), f(config.unknown_cost), f(config.background_per_px),
-        f(config.background_most),
+        match1.disparity, match1.matched, front, match1.words_left, np.ascontiguousarray(match1.words_right[..., ::-1]),
+        match2.words_left, match2.words_right, labels.astype(np.int32), homographies.astype(f),
+        f(config.anchor_per_px), f(config.hidden_cost), f(config.contradicted_cost), f(config.time_weight),
+        f(config.unknown_cost), f(config.background_per_px), f(config.background_most), costs,
     )  # fmt: skip
     filled, _ = aggregate(costs, grey, replace(matching, small_step=config.small_step))
     return cv2.medianBlur(np.where(match1.matched, match1.disparity, filled), 5)

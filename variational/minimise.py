@@ -38,8 +38,9 @@ def _solve4(a: np.ndarray, b: np.ndarray) -> None:
 
 @parallel
 def _smoothness_weights(
-    field: np.ndarray, edges: np.ndarray, edges2: np.ndarray, lambdas: np.ndarray, eps2: float, weights: np.ndarray, energy: np.ndarray
-) -> None:
+    field: np.ndarray, edges: np.ndarray, edges2: np.ndarray, lambdas: np.ndarray, eps2: float,
+    weights: np.ndarray, energy: np.ndarray,
+) -> None:  # fmt: skip
     """weights (H, W, 2 * GROUPS): between each pixel and the one to the left, then the one above; 0 at the border."""
     _, height, width = field.shape
     for y in prange(height):
@@ -66,8 +67,9 @@ def _smoothness_weights(
 
 @parallel
 def _sweep(
-    field: np.ndarray, systems: np.ndarray, right_side: np.ndarray, weights: np.ndarray, pull: np.ndarray, colour: int, omega: float
-) -> None:
+    field: np.ndarray, systems: np.ndarray, right_side: np.ndarray, weights: np.ndarray, pull: np.ndarray,
+    colour: int, omega: float,
+) -> None:  # fmt: skip
     """One half sweep over the pixels of one colour; right_side (H, W, 5) is in the order D1, C, u, v, D2."""
     _, height, width = field.shape
     for y in prange(height):

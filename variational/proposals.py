@@ -14,8 +14,10 @@ from variational.evidence import EvidenceConfig, refill
 from variational.fusion import FusionConfig, choose, motion_costs
 from variational.initialise import Start, sample
 from variational.matching import MatchingConfig
+from variational.objects import ObjectsConfig, find_objects, unexplained_surfaces
 from variational.rigid import Correspondences, RigidConfig, RigidMotion, displacement, find_motions, guess_camera
 from variational.state import D1, C, flow_of
+from variational.visibility import project_visibility
 
 MEASURED = -1
 """Label of pixels that keep their measured motion; 0 is the camera's, 1, 2, ... the objects'."""
@@ -81,16 +83,16 @@ def _nearby(motions: list[RigidMotion], slots: int = 3) -> np.ndarray:
 
 
 def propose(
-    start: Start, grey: np.ndarray, camera: StereoCamera | None, matching: MatchingConfig, rigid: RigidConfig,
-    fusion: FusionConfig, evidence: EvidenceConfig,
+    start: Start, grey: np.ndarray, grey2: np.ndarray, camera: StereoCamera | None, matching: MatchingConfig, rigid: RigidConfig,
+    objects: ObjectsConfig, fusion: FusionConfig, evidence: EvidenceConfig,
 ) -> Proposal:  # fmt: skip
     """Fuse the start with rigid motions.
 
     Parameters
     ----------
     start : Start
-    grey : np.ndarray
-        (H, W) float32, left1.
+    grey, grey2 : np.ndarray
+        (H, W) float32, left1 and left2.
     camera : StereoCamera or None
         With it the motions are metric; without, see variational.rigid.
 
@@ -99,26 +101,33 @@ def propose(
     Proposal
     """
     matches = correspondences(start)
-    motions = find_motions(matches, camera or guess_camera(matches, rigid), rigid)
+    camera = camera or guess_camera(matches, rigid)
+    motions = find_motions(matches, camera, rigid)
     if not motions:
         return keep(start)
-    nothing = keep(start).labels
     words = (start.match1.words_left, start.match2.words_left, start.match2.words_right)
-    labels_of = np.concatenate([nothing[None], nothing[None] + 1, _nearby(motions)])
-    homographies = np.stack([motion.homography for motion in motions])
     state = start.state.copy()
-    for final in (False, True):
+
+    def fuse() -> tuple[np.ndarray, np.ndarray]:
+        """Labels and costs under the motions so far; writes the chosen motion to the state."""
+        labels_of = np.concatenate([np.array([MEASURED, 0])[:, None, None] + np.zeros_like(nothing), _nearby(motions)])
         candidates = _candidates(state, start, motions, labels_of)
         costs = motion_costs(candidates, state[D1], words, fusion)
         biased = costs.copy()
         biased[0] += fusion.measured_prior
         biased[2:] += fusion.object_prior
         chosen = choose(candidates, biased, state[D1], grey, fusion)[None]
-        labels = np.take_along_axis(labels_of, chosen, 0)[0]
-        if not final:
-            state[D1] = refill(start.match1, start.match2, grey, labels, homographies, matching, evidence)
-    state[C:] = np.take_along_axis(candidates, chosen[:, None], 0)[0]
-    return Proposal(state, labels, motions, np.take_along_axis(costs, chosen, 0)[0])
+        state[C:] = np.take_along_axis(candidates, chosen[:, None], 0)[0]
+        return np.take_along_axis(labels_of, chosen, 0)[0], np.take_along_axis(costs, chosen, 0)[0]
+
+    nothing = keep(start).labels
+    labels, cost = fuse()
+    surfaces = unexplained_surfaces(state[D1], cost, project_visibility(state), objects)
+    motions += find_objects(start, state[D1], grey, grey2, surfaces, camera.projection(), objects)
+    homographies = np.stack([motion.homography for motion in motions])
+    state[D1] = refill(start.match1, start.match2, grey, labels, homographies, matching, evidence)
+    labels, cost = fuse()
+    return Proposal(state, labels, motions, cost)
 
 
 def _candidates(state: np.ndarray, start: Start, motions: list[RigidMotion], labels_of: np.ndarray) -> np.ndarray:

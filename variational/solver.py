@@ -9,15 +9,18 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from variational.camera import StereoCamera
+from variational.confidence import confidence
 from variational.descent import DescentConfig, FromZeroConfig, History, RefineConfig, descend_energy, from_zero, refine
 from variational.energy import EnergyConfig
 from variational.evidence import EvidenceConfig
 from variational.frames import Frames
 from variational.fusion import FusionConfig
-from variational.initialise import MIN_SIDE, StartName, initialise, to_grey
+from variational.initialise import MIN_SIDE, StartName, initialise, sample, to_grey
 from variational.matching import MatchingConfig
+from variational.objects import ObjectsConfig
 from variational.proposals import MEASURED, keep, propose
 from variational.rigid import RigidConfig
+from variational.state import flow_of
 from variational.terms.constancy import ConstancyConfig
 from variational.visibility import backward_flow, project_visibility
 
@@ -36,7 +39,7 @@ class SolverConfig:
         from which a coarse-to-fine minimisation begins.
     proposals : bool
         Fuse the start with rigid motions (variational.proposals).
-    matching, rigid, fusion, evidence, from_zero, refine, constancy
+    matching, rigid, objects, fusion, evidence, from_zero, refine, constancy
         Settings of the parts.
     descent, energy
         First-order descent of the consistency energy after all else, and that energy; off unless descent.levels > 0.
@@ -46,6 +49,7 @@ class SolverConfig:
     proposals: bool = True
     matching: MatchingConfig = field(default_factory=MatchingConfig)
     rigid: RigidConfig = field(default_factory=RigidConfig)
+    objects: ObjectsConfig = field(default_factory=ObjectsConfig)
     fusion: FusionConfig = field(default_factory=FusionConfig)
     evidence: EvidenceConfig = field(default_factory=EvidenceConfig)
     from_zero: FromZeroConfig = field(default_factory=FromZeroConfig)
@@ -145,7 +149,10 @@ def solve(
     proposal = keep(start)
     if config.proposals:
         with stage("proposals", 0.5):
-            proposal = propose(start, grey, camera, config.matching, config.rigid, config.fusion, config.evidence)
+            proposal = propose(
+                start, grey, to_grey(frames.left2), camera, config.matching, config.rigid, config.objects, config.fusion,
+                config.evidence,
+            )  # fmt: skip
     with stage("refine", 0.8):
         matched = (start.match1.matched, start.match2.matched)
         rigid = proposal.labels != MEASURED
@@ -158,9 +165,10 @@ def solve(
     with stage("visibility", 0.9):
         backward = backward_flow(state, start.backward_flow)
         visible = project_visibility(state)
-        confidence = np.ones(grey.shape, np.float32)
+        matched2 = sample(start.match2.matched.astype(np.float32), flow_of(state)) > 0.5
+        trust = confidence(state, proposal.cost, start.match1.matched, matched2, visible)
     if progress:
         progress("done", 1.0)
     moving = proposal.labels != 0 if proposal.motions else None
     motion = proposal.motions[0].transform if proposal.motions and camera else None
-    return Solution(state, visible, confidence, moving, motion, initial, backward, history, reason, seconds)
+    return Solution(state, visible, trust, moving, motion, initial, backward, history, reason, seconds)

@@ -1,0 +1,113 @@
+"""Moving objects that dense flow lost: found by sparse features in what no motion explains.
+
+Where no candidate motion makes the images agree, although the pixels should be seen at time 2, something moved in a way
+that dense flow could not follow. Local features are matched over the whole of left2 there, and each connected surface of
+those pixels gets a rigid fit of its own. Features: SIFT (Lowe 2004).
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from variational.initialise import Start, to_bytes
+from variational.rigid import RigidMotion, fit_motion
+
+
+@dataclass(frozen=True)
+class ObjectsConfig:
+    """Search for objects by features.
+
+    Parameters
+    ----------
+    cost : float
+        A pixel is unexplained if its chosen motion costs more than this (variational.fusion), in [0, 1].
+    least_px : int
+        Fewest unexplained pixels of a surface.
+    jump_px : float
+        A difference of disparity between neighbours that separates two surfaces.
+    ratio : float
+        A feature is matched if its best match is this much closer than the second best.
+    least_matches : int
+        Fewest matched features that a motion is fitted to, and must explain.
+    """
+
+    cost: float = 0.45
+    least_px: int = 150
+    jump_px: float = 1.5
+    ratio: float = 0.85
+    least_matches: int = 6
+
+
+def unexplained_surfaces(
+    disparity: np.ndarray, cost: np.ndarray, visible: np.ndarray, config: ObjectsConfig
+) -> list[np.ndarray]:
+    """Connected surfaces of pixels that no motion explains: (H, W) bool masks, the largest first."""
+    open_ = ((cost > config.cost) & visible).astype(np.uint8)
+    open_ = cv2.morphologyEx(open_, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
+    for axis in (0, 1):
+        jump = np.abs(np.diff(disparity, axis=axis)) > config.jump_px
+        open_[(slice(None),) * axis + (slice(1, None),)][jump] = 0
+    _, labels, statistics, _ = cv2.connectedComponentsWithStats(open_, connectivity=4)
+    order = np.argsort(-statistics[1:, cv2.CC_STAT_AREA], kind="stable")[:24] + 1
+    return [labels == k for k in order if statistics[k, cv2.CC_STAT_AREA] >= config.least_px]
+
+
+def find_objects(
+    start: Start, disparity: np.ndarray, left1: np.ndarray, left2: np.ndarray, surfaces: list[np.ndarray],
+    projection: np.ndarray, config: ObjectsConfig,
+) -> list[RigidMotion]:  # fmt: skip
+    """Rigid motions of surfaces, from sparse features.
+
+    Parameters
+    ----------
+    start : Start
+        For the disparity at time 2.
+    disparity : np.ndarray
+        (H, W) at time 1, pixels.
+    left1, left2 : np.ndarray
+        (H, W) grey in [0, 1].
+    surfaces : list of np.ndarray
+        (H, W) bool masks.
+    projection : np.ndarray
+        (4, 4) of the camera.
+
+    Returns
+    -------
+    list of RigidMotion
+        One for each surface whose features agree on a motion.
+    """
+    if not surfaces:
+        return []
+    detector = cv2.SIFT.create(contrastThreshold=0.01)
+    around = cv2.dilate(np.any(surfaces, axis=0).astype(np.uint8), np.ones((9, 9), np.uint8))
+    points1, words1 = detector.detectAndCompute(to_bytes(left1), around)
+    points2, words2 = detector.detectAndCompute(to_bytes(left2), None)
+    if words1 is None or words2 is None or len(points2) < 2:
+        return []
+    matcher = cv2.BFMatcher(cv2.NORM_L2)
+    pairs = [pair for pair in matcher.knnMatch(words1, words2, k=2) if len(pair) == 2]
+    good = [m for m, second in pairs if m.distance < config.ratio * second.distance]
+    if len(good) < config.least_matches:
+        return []
+    at1 = np.array([points1[m.queryIdx].pt for m in good])
+    at2 = np.array([points2[m.trainIdx].pt for m in good])
+    x1, y1, x2, y2 = np.rint(np.hstack([at1, at2])).astype(np.intp).T
+    first = np.column_stack([at1, disparity[y1, x1]])
+    second = np.column_stack([at2, start.match2.disparity[y2, x2]])
+    usable = (first[:, 2] > 0.5) & start.match2.matched[y2, x2] & (second[:, 2] > 0.5)
+    motions = []
+    for surface in surfaces:
+        near = cv2.dilate(surface.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
+        chosen = np.flatnonzero(usable & near[y1, x1])
+        if len(chosen) < config.least_matches:
+            continue
+        transform = fit_motion(first[chosen], second[chosen], projection)
+        if transform is None:
+            continue
+        homography = projection @ transform @ np.linalg.inv(projection)
+        moved = np.column_stack([first[chosen], np.ones(len(chosen))]) @ homography.T
+        distance = np.linalg.norm(moved[:, :3] / moved[:, 3:] - second[chosen], axis=1)
+        if np.count_nonzero(distance < 2.0) >= config.least_matches:
+            motions.append(RigidMotion(transform, homography, surface))
+    return motions
