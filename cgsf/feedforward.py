@@ -55,7 +55,7 @@ def run_networks(
     except ValueError as error:
         raise InputError(str(error)) from None
     disparity, motion = (fold_normalisation(load_network(name)) for name in (config.disparity, config.motion))
-    module = FeedforwardModule(disparity, motion, config.precision).eval().to(device)  # type: ignore[arg-type]
+    module = FeedforwardModule(disparity, motion, config.precision).eval().to(device)
     with torch.inference_mode():
         state, backward = module(*(to_tensor(image).to(device) for image in (
             frames.left1, frames.right1, frames.left2, frames.right2)))
