@@ -4,9 +4,9 @@ Three independent ways to the same numbers: the handwritten kernels (:mod:`varia
 (:mod:`learned.consistency`), and central differences of the handwritten energy. They are compared for every term alone
 and all together, channel by channel.
 
-A piecewise smooth energy has kinks: cell borders of the bilinear sampler, zeros of the absolute values, SSIM where it is
-clipped, positions at the edge of the image. There the three may rightly differ. Such pixels are found from the state (never
-from a deviation), left out, and counted; on a random state they may be at most one percent.
+A piecewise smooth energy has kinks: cell borders of the bilinear sampler, zeros of the absolute values, SSIM where it
+is clipped, positions at the edge of the image. There the three may rightly differ. Such pixels are found from the state
+(never from a deviation), left out, and counted; on a random state they may be at most one percent.
 """
 
 from __future__ import annotations
@@ -97,7 +97,9 @@ class Row:
 
     def as_json(self) -> dict[str, object]:
         """The row for a JSON file, which has no numbers for what is not finite: those become null."""
-        return {key: None if isinstance(value, float) and not np.isfinite(value) else value for key, value in asdict(self).items()}
+        hollow = {key: None for key, value in asdict(self).items() if isinstance(value, float) and not
+        np.isfinite(value)}
+        return asdict(self) | hollow
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,7 +149,8 @@ def _at_source(flow: np.ndarray) -> np.ndarray:
     found = np.stack([u, v])
     for _ in range(10):
         grid = (x - found[0], y - found[1])
-        found = np.stack([cv2.remap(plane, *grid, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for plane in (u, v)])
+        found = np.stack([cv2.remap(plane, *grid, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+                          for plane in (u, v)])
     return found.astype(np.float64)
 
 
@@ -160,7 +163,8 @@ def random_scene(size: tuple[int, int], seed: int = 0, channels: int = 3) -> Sce
 
 def frames_scene(name: str, frames: Frames, seed: int = 0) -> Scene:
     """Real images with a random state, float64."""
-    return Scene(name, frames.astype(np.float64), *random_state(np.random.default_rng(seed), frames.shape), random=False)
+    state, back = random_state(np.random.default_rng(seed), frames.shape)
+    return Scene(name, frames.astype(np.float64), state, back, random=False)
 
 
 def kink_mask(scene: Scene, config: EnergyConfig, tolerance: float) -> np.ndarray:
@@ -169,7 +173,8 @@ def kink_mask(scene: Scene, config: EnergyConfig, tolerance: float) -> np.ndarra
     d1, d2, change, u, v = state.unbind(1)
     kinks = torch.zeros_like(state, dtype=torch.bool)
     visible = consistency.visible_mask(state[:, 3:], back, config.visible_relative, config.visible_absolute)
-    photometric = [([0], left1, right1, -d1, None, config.stereo_weight), ([1], left2, right2, -d2, None, config.stereo_weight),
+    photometric = [([0], left1, right1, -d1, None, config.stereo_weight),
+                   ([1], left2, right2, -d2, None, config.stereo_weight),
                    ([3, 4], left1, left2, u, v, config.flow_weight)]
     for channels, target, source, dx, dy, weight in photometric:
         if weight > 0:
@@ -258,7 +263,8 @@ def taylor_order(energy: Energy, state: np.ndarray, gradient: np.ndarray, direct
     return float(np.polyfit(np.log(steps), np.log(np.maximum(remainders, 1e-300)), 1)[0])
 
 
-def central_differences(energy: Energy, state: np.ndarray, pixels: np.ndarray, visible: np.ndarray, h: float = 1e-6) -> np.ndarray:
+def central_differences(energy: Energy, state: np.ndarray, pixels: np.ndarray, visible: np.ndarray,
+                        h: float = 1e-6) -> np.ndarray:
     """Derivatives of the energy by single entries of the state; `pixels` ``(n, 3)`` of (channel, y, x)."""
     derivatives = np.empty(len(pixels))
     for i, (channel, y, x) in enumerate(pixels):
@@ -318,7 +324,8 @@ def compare(scene: Scene, term: str, dtype: str = "float64", damage: float = 0.0
             orders = []
             for _ in range(3):  # along one direction the second-order parts may happen to cancel
                 direction = np.zeros_like(typed.state)
-                direction[channel] = rng.uniform(0.5, 1, smooth.shape) * rng.choice([-1, 1], smooth.shape) * ~wide[channel]
+                signs = rng.choice([-1, 1], smooth.shape) * ~wide[channel]
+                direction[channel] = rng.uniform(0.5, 1, smooth.shape) * signs
                 orders.append(taylor_order(energy, typed.state, gradient, direction, visible))
             order = float(np.median(orders))
             pixels = rng.permutation(np.argwhere(smooth))[:samples]
@@ -339,8 +346,8 @@ def _visible(scene: Scene, config: EnergyConfig) -> np.ndarray:
     return mask[0].numpy()
 
 
-def gradcheck(scenes: Sequence[Scene], terms: Sequence[str] = tuple(TERMS), dtype: str = "float64", damaged_term: str | None = None,
-              seed: int = 0) -> tuple[list[Row], dict[str, np.ndarray]]:
+def gradcheck(scenes: Sequence[Scene], terms: Sequence[str] = tuple(TERMS), dtype: str = "float64",
+              damaged_term: str | None = None, seed: int = 0) -> tuple[list[Row], dict[str, np.ndarray]]:
     """The whole table: every term on every scene.
 
     `damaged_term` gets a gradient that is 1 % wrong. Returns the rows and the deviation maps, keyed "scene term".

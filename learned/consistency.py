@@ -24,8 +24,8 @@ def penalty(residual: Tensor, eps: float) -> Tensor:
 def sample(image: Tensor, dx: Tensor, dy: Tensor | None = None) -> Tensor:
     """Bilinear sampling at displaced pixels.
 
-    Positions are clamped to the image; a clamped coordinate has zero derivative. The displacement is clamped and split, not
-    the sum, which would cost float32 its digits.
+    Positions are clamped to the image; a clamped coordinate has zero derivative. The displacement is clamped and split,
+    not the sum, which would cost float32 its digits.
 
     Parameters
     ----------

@@ -3,8 +3,8 @@
 Two ways to use it, both batched:
 
 * :meth:`Oracle.features`: loss map and gradient as plain tensors without a graph, the refiner's input;
-* :meth:`Oracle.energy`: a scalar a sample that autograd can differentiate, whose backward pass is the analytic gradient,
-  so that self-supervised training on the CPU never builds the twin's graph.
+* :meth:`Oracle.energy`: a scalar a sample that autograd can differentiate, whose backward pass is the analytic
+  gradient, so that self-supervised training on the CPU never builds the twin's graph.
 
 On the CPU the kernels read and write the tensors' own memory. Tensors on any other device go to the twin
 (:mod:`learned.consistency`), which gives the same numbers more slowly. How numba's and torch's threads share the cores
@@ -38,8 +38,8 @@ class Oracle:
         Weights and options.
     """
 
-    def __init__(self, left1: Tensor, right1: Tensor, left2: Tensor, right2: Tensor, backward_flow: Tensor | None = None,
-                 config: EnergyConfig | None = None) -> None:
+    def __init__(self, left1: Tensor, right1: Tensor, left2: Tensor, right2: Tensor,
+                 backward_flow: Tensor | None = None, config: EnergyConfig | None = None) -> None:
         self.config = config or EnergyConfig()
         self._images = tuple(image.detach() for image in (left1, right1, left2, right2))
         self._backward = None if backward_flow is None else backward_flow.detach()

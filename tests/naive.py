@@ -21,7 +21,7 @@ def sample(plane: np.ndarray, x: float, y: float) -> float:
     """Bilinear value of an (H, W) plane at a position, clamped to the border."""
     height, width = plane.shape
     x, y = min(max(x, 0.0), width - 1.0), min(max(y, 0.0), height - 1.0)
-    x0, y0 = int(math.floor(x)), int(math.floor(y))
+    x0, y0 = math.floor(x), math.floor(y)
     x1, y1 = min(x0 + 1, width - 1), min(y0 + 1, height - 1)
     fx, fy = x - x0, y - y0
     top = (1 - fx) * plane[y0, x0] + fx * plane[y0, x1]
@@ -111,5 +111,6 @@ def energy_map(frames, state: np.ndarray, backward: np.ndarray | None, config) -
     total += config.coupling_weight * visible * coupling(state, config.charbonnier_px)
     for channel in range(5):
         image = frames.left2 if channel == 1 else frames.left1
-        total += config.smoothness_weight * smoothness(state[channel], image, config.edge_sharpness, config.charbonnier_px)
+        plain = smoothness(state[channel], image, config.edge_sharpness, config.charbonnier_px)
+        total += config.smoothness_weight * plain
     return total

@@ -1,7 +1,7 @@
 """The consistency energy and its analytic gradient: the gradient oracle that everything else uses.
 
-``L = w_pd L_pd + w_pf L_pf + w_df L_df + w_s L_s`` per pixel, the energy its sum; formulas stand in :mod:`variational.terms`,
-the table formula -> function in docs/energy.md. Defaults are the paper's.
+``L = w_pd L_pd + w_pf L_pf + w_df L_df + w_s L_s`` per pixel, the energy its sum; formulas stand in
+:mod:`variational.terms`, the table formula -> function in docs/energy.md. Defaults are the paper's.
 """
 
 from __future__ import annotations
@@ -69,12 +69,13 @@ class EnergyConfig:
 
 @parallel
 def _evaluate(state: np.ndarray, left1: np.ndarray, right1: np.ndarray, left2: np.ndarray, right2: np.ndarray,
-              left2_source: np.ndarray, edges1: np.ndarray, edges2: np.ndarray, backward: np.ndarray, overlap_y: np.ndarray,
-              overlap_x: np.ndarray, visible1: np.ndarray, visible2: np.ndarray, find_visible: bool, visible: np.ndarray,
-              weights: tuple[float, float, float, float], alpha: float, eps_intensity: float, eps_px: float, w1: float,
-              w2: float, drop_outside: bool, bands: np.ndarray, loss: np.ndarray, gradient: np.ndarray, index: np.ndarray,
-              parts: np.ndarray, with_gradient: bool) -> None:
-    """Add every term to `loss` and `gradient`. Three sweeps, because a band's stencil reads its neighbours' visibility."""
+              left2_source: np.ndarray, edges1: np.ndarray, edges2: np.ndarray, backward: np.ndarray,
+              overlap_y: np.ndarray, overlap_x: np.ndarray, visible1: np.ndarray, visible2: np.ndarray,
+              find_visible: bool, visible: np.ndarray, weights: tuple[float, float, float, float], alpha: float,
+              eps_intensity: float,
+              eps_px: float, w1: float, w2: float, drop_outside: bool, bands: np.ndarray, loss: np.ndarray,
+              gradient: np.ndarray, index: np.ndarray, parts: np.ndarray, with_gradient: bool) -> None:
+    """Add every term to `loss` and `gradient`. Three sweeps: a stencil reads the visibility of other bands."""
     w_stereo, w_flow, w_coupling, w_smooth = weights
     for band in prange(bands.size - 1):
         first, last = bands[band], bands[band + 1]
@@ -130,7 +131,8 @@ class Energy:
         if backward_flow is not None and backward_flow.shape != (*frames.shape, 2):
             raise ValueError(f"backward_flow must have shape {(*frames.shape, 2)}, not {backward_flow.shape}")
         everywhere = np.ones(frames.shape, np.bool_)
-        self._visible = [everywhere if mask is None else _mask(mask, frames.shape) for mask in (visible_stereo1, visible_stereo2)]
+        self._visible = [everywhere if mask is None else _mask(mask, frames.shape)
+                         for mask in (visible_stereo1, visible_stereo2)]
         self._everywhere = everywhere
         self._prepared: dict[np.dtype, tuple[np.ndarray, ...]] = {}
 
@@ -150,7 +152,7 @@ class Energy:
         Returns
         -------
         loss : np.ndarray
-            ``(H, W)``; its sum is the energy (:func:`variational.jit.total` has the same bits for any number of threads).
+            ``(H, W)``; its sum is the energy (:func:`variational.jit.total`: same bits for any threads).
         gradient : np.ndarray
             ``(5, H, W)``, derivative of the sum, per pixel of disparity or flow.
         """
@@ -177,10 +179,10 @@ class Energy:
         index, parts = np.empty(shape, np.int32), np.empty((3, *shape), state.dtype)  # of the coupling term
         weights = (float(config.stereo_weight), float(config.flow_weight), float(config.coupling_weight),
                    float(config.smoothness_weight))
-        _evaluate(state, *self._inputs(state.dtype), *self._visible, find_visible, mask, weights, float(config.ssim_share),
-                  float(config.charbonnier_intensity), float(config.charbonnier_px), float(config.visible_relative),
-                  float(config.visible_absolute), bool(config.drop_outside), band_edges(shape[0]), loss, gradient, index,
-                  parts, with_gradient)
+        _evaluate(state, *self._inputs(state.dtype), *self._visible, find_visible, mask, weights,
+                  float(config.ssim_share), float(config.charbonnier_intensity), float(config.charbonnier_px),
+                  float(config.visible_relative), float(config.visible_absolute), bool(config.drop_outside),
+                  band_edges(shape[0]), loss, gradient, index, parts, with_gradient)
         return loss, gradient
 
     def _inputs(self, dtype: np.dtype) -> tuple[np.ndarray, ...]:

@@ -3,16 +3,16 @@
 Three kinds of kernel, from the inside out:
 
 * ``@scalar``   a few operations on numbers, inlined by LLVM into whoever calls it;
-* ``@rowwise``  a loop over one image row, or a band of rows; its array arguments **must not overlap**, which is promised
-  to LLVM, and without which it would vectorise neither a loop with many streams nor one that gathers;
+* ``@rowwise``  a loop over one image row, or a band of rows; its array arguments **must not overlap**, which is
+  promised to LLVM, and without which it would vectorise neither a loop with many streams nor one that gathers;
 * ``@parallel`` the outermost loop, ``prange`` over bands of rows.
 
 Results have the same bits for any number of threads, by construction: every output pixel is written by one band, with
 the same instructions wherever the band begins, and sums are one float64 partial a row, added in order
 (:func:`total`). A parallel scalar reduction would give another sum for every number of threads.
 
-Fast-math is on without ``nnan`` and ``ninf``, so that a NaN in the input is seen in the output. Compiled code is cached on
-disk beside the sources; numba notices a change of a kernel's own file only, so after changing a ``@scalar`` that is
+Fast-math is on without ``nnan`` and ``ninf``, so that a NaN in the input is seen in the output. Compiled code is cached
+on disk beside the sources; numba notices a change of a kernel's own file only, so after changing a ``@scalar`` that is
 used from another file, delete the ``__pycache__`` folders.
 """
 

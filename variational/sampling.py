@@ -45,7 +45,7 @@ def cell(displacement: float, coordinate: float, size: float) -> tuple[float, fl
 
 @scalar
 def interpolate(v00: float, v01: float, v10: float, v11: float, fx: float, fy: float) -> tuple[float, float, float]:
-    """Value of the bilinear interpolant and its derivatives along x and y; ``v01`` is the right neighbour of ``v00``."""
+    """Value of the bilinear interpolant and its derivatives along x and y; ``v01`` lies right of ``v00``."""
     top, bottom = v01 - v00, v11 - v10
     left = v00 + fx * top
     down = v10 + fx * bottom - left

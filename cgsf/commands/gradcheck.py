@@ -32,12 +32,14 @@ class Size(click.ParamType):
 
 @click.command()
 @click.option("--frames", type=click.Path(path_type=Path), help="Folder of four images to check on as well.")
-@click.option("--size", type=Size(), default="48x64", show_default=True, help="Size of the random scene; frames are resized to it.")
+@click.option("--size", type=Size(), default="48x64", show_default=True,
+              help="Of the random scene; frames are resized to it.")
 @click.option("--dtype", type=click.Choice(["float64", "float32"]), default="float64", show_default=True)
-@click.option("--terms", default="stereo,flow,coupling,smoothness,all", show_default=True, help="Terms to check, by comma.")
+@click.option("--terms", default="stereo,flow,coupling,smoothness,all", show_default=True, help="Which, by comma.")
 @click.option("--seed", type=int, default=0, show_default=True)
-@click.option("--json", "json_file", type=click.Path(path_type=Path, dir_okay=False), help="Write the table to this file.")
-@click.option("-o", "--output", type=click.Path(path_type=Path, file_okay=False), help="Folder for gradcheck.json and pictures.")
+@click.option("--json", "json_file", type=click.Path(path_type=Path, dir_okay=False), help="File for the table.")
+@click.option("-o", "--output", type=click.Path(path_type=Path, file_okay=False),
+              help="For gradcheck.json and pictures.")
 @click.option("--damage", hidden=True, help="Make this term's gradient 1 % wrong, to see the check fail.")
 def command(frames: Path | None, size: tuple[int, int], dtype: str, terms: str, seed: int, json_file: Path | None,
             output: Path | None, damage: str | None) -> None:
@@ -56,7 +58,8 @@ def command(frames: Path | None, size: tuple[int, int], dtype: str, terms: str, 
     click.echo(f"{'scene':16} {'term':10} ch  max dev  mean dev differences order  kinks %   sums")
     for row in rows:
         click.echo(f"{row.scene:16.16} {row.term:10} {row.channel:2} {row.max_deviation:8.1e} {row.mean_deviation:8.1e}"
-                   f" {row.difference:11.1e} {row.order:5.2f} {100 * row.kinks:8.3f} {row.total:7.1e}{'' if row.ok else '  FAIL'}")
+                   f" {row.difference:11.1e} {row.order:5.2f} {100 * row.kinks:8.3f} {row.total:7.1e}"
+                   f"{'' if row.ok else '  FAIL'}")
     table = json.dumps({"dtype": dtype, "seed": seed, "rows": [row.as_json() for row in rows]}, indent=1)
     if json_file is not None:
         json_file.write_text(table)

@@ -26,7 +26,8 @@ THREADS = min(2, numba.config.NUMBA_NUM_THREADS)
 def single(size):
     """A random scene in float32, as arrays and as tensors with a batch axis."""
     scene = random_scene(size)
-    frames, state, back = scene.frames.astype(np.float32), scene.state.astype(np.float32), scene.backward_flow.astype(np.float32)
+    frames = scene.frames.astype(np.float32)
+    state, back = scene.state.astype(np.float32), scene.backward_flow.astype(np.float32)
     arrays = (frames.left1, frames.right1, frames.left2, frames.right2, back)
     tensors = [torch.from_numpy(np.ascontiguousarray(array.transpose(2, 0, 1)))[None] for array in arrays]
     return frames, state, back, torch.from_numpy(state)[None], tensors

@@ -65,7 +65,8 @@ def test_real_images_and_pictures(tmp_path):
 
 
 @pytest.mark.parametrize(("arguments", "message"), [
-    (("--terms", "colour"), "unknown term 'colour'"), (("--size", "4x4"), "is not a size"), (("--frames", "nowhere"), "no such folder"),
+    (("--terms", "colour"), "unknown term 'colour'"), (("--size", "4x4"), "is not a size"),
+    (("--frames", "nowhere"), "no such folder"),
 ])
 def test_bad_input(arguments, message):
     result = run(*arguments)

@@ -13,7 +13,8 @@ from tests import naive
 from tests.tolerances import EXACT
 from variational.energy import EnergyConfig
 
-OPTIONS = EnergyConfig(drop_outside=True, charbonnier_intensity=0.01, charbonnier_px=0.05, edge_sharpness=7, ssim_share=0.6)
+OPTIONS = EnergyConfig(drop_outside=True, charbonnier_intensity=0.01, charbonnier_px=0.05, edge_sharpness=7,
+                       ssim_share=0.6)
 
 
 def tensors(scene):

@@ -17,7 +17,8 @@ def batch(count=2, size=(18, 25), dtype=torch.float64):
         scene = random_scene(size, seed)
         frames = scene.frames
         arrays = (frames.left1, frames.right1, frames.left2, frames.right2, scene.backward_flow)
-        parts.append([torch.from_numpy(scene.state), *(torch.from_numpy(np.ascontiguousarray(a.transpose(2, 0, 1))) for a in arrays)])
+        planes = [torch.from_numpy(np.ascontiguousarray(array.transpose(2, 0, 1))) for array in arrays]
+        parts.append([torch.from_numpy(scene.state), *planes])
     return [torch.stack(part).to(dtype) for part in zip(*parts, strict=True)]
 
 

@@ -1,4 +1,4 @@
-"""The energy and its gradient: against the plain twin, Taylor's theorem, symmetries, precision, threads; and it can fail."""
+"""The energy and its gradient: against the plain twin, Taylor's theorem, symmetries, precision, threads."""
 
 from dataclasses import replace
 
@@ -14,7 +14,8 @@ from variational.frames import Frames
 from variational.jit import total
 from variational.state import D1, D2, C, U, V
 
-OPTIONS = EnergyConfig(drop_outside=True, charbonnier_intensity=0.01, charbonnier_px=0.05, edge_sharpness=7, ssim_share=0.6)
+OPTIONS = EnergyConfig(drop_outside=True, charbonnier_intensity=0.01, charbonnier_px=0.05, edge_sharpness=7,
+                       ssim_share=0.6)
 TERMS = {
     "stereo": EnergyConfig(1, 0, 0, 0), "flow": EnergyConfig(0, 1, 0, 0), "coupling": EnergyConfig(0, 0, 1, 0),
     "smoothness": EnergyConfig(0, 0, 0, 1), "paper": EnergyConfig(), "options": OPTIONS,
@@ -56,7 +57,8 @@ def remainder_orders(config, gradient_error=None):
     for _ in range(3):
         direction = rng.choice([-1.0, 1.0], state.shape)
         slope = (gradient * direction).sum()
-        remainders = [abs((energy.value_and_gradient(state + h * direction, visible)[0] - loss).sum() - h * slope) for h in steps]
+        moved = [energy.value_and_gradient(state + h * direction, visible)[0] for h in steps]
+        remainders = [abs((m - loss).sum() - h * slope) for m, h in zip(moved, steps, strict=True)]
         orders.append(np.polyfit(np.log(steps), np.log(remainders), 1)[0])
     return np.median(orders)
 
@@ -97,7 +99,8 @@ def test_flipped_upside_down():
     frames, state, back = problem((16, 22))
     loss, gradient = Energy(frames, OPTIONS, back).value_and_gradient(state)
     flip = np.array([1, 1, 1, 1, -1.0])[:, None, None]
-    flipped = Frames(*(np.ascontiguousarray(getattr(frames, name)[::-1]) for name in ("left1", "right1", "left2", "right2")))
+    images = (frames.left1, frames.right1, frames.left2, frames.right2)
+    flipped = Frames(*(np.ascontiguousarray(image[::-1]) for image in images))
     loss_f, gradient_f = Energy(flipped, OPTIONS, back[::-1] * [1, -1]).value_and_gradient(
         np.ascontiguousarray(state[:, ::-1] * flip))
     close(gradient_f[:, ::-1] * flip, gradient, 1e-10)

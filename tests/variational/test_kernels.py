@@ -11,7 +11,8 @@ from variational.terms.photometric import padded_planes, reflect, window_overlap
 
 @pytest.mark.parametrize(("displacement", "coordinate", "size", "expected"), [
     (0.25, 3, 8, (0, 0.25, True)), (-0.25, 3, 8, (-1, 0.75, True)), (4, 3, 8, (3, 1, True)), (-3, 3, 8, (-3, 0, True)),
-    (4.5, 3, 8, (3, 1, False)), (-9, 3, 8, (-3, 0, False)), (np.inf, 3, 8, (3, 1, False)), (np.nan, 3, 8, (-3, 0, False)),
+    (4.5, 3, 8, (3, 1, False)), (-9, 3, 8, (-3, 0, False)), (np.inf, 3, 8, (3, 1, False)),
+    (np.nan, 3, 8, (-3, 0, False)),
     (0, 0, 1, (0, 0, True)), (2, 0, 1, (0, 0, False)),
 ])
 def test_cell(displacement, coordinate, size, expected):

@@ -2,9 +2,10 @@
 
 ``O rho(D1 + C - D2(p + F))`` in pixels, D2 on left2's grid, sampled bilinearly.
 
-Gradient. By D1, C, u and v it is local. By D2 it is the adjoint of sampling, a *scatter* to the four pixels around p + F.
-To stay parallel and keep the same bits for any number of threads, a band of *target* rows looks through the source rows
-that reach it, in order, and adds what falls into it: every target pixel receives its parts in raster order of the source.
+Gradient. By D1, C, u and v it is local. By D2 it is the adjoint of sampling, a *scatter* to the four pixels around p +
+F. To stay parallel and keep the same bits for any number of threads, a band of *target* rows looks through the source
+rows that reach it, in order, and adds what falls into it: every target pixel receives its parts in raster order of the
+source.
 """
 
 import numpy as np
@@ -32,7 +33,8 @@ def _coupling_row(d1: np.ndarray, d2: np.ndarray, change: np.ndarray, u: np.ndar
         shift_y, fy[i], inside_y = cell(v[i], row, height)
         index[i] = start + x + np.int32(shift_x) + np.int32(shift_y) * stride
         k = np.uint32(index[i])
-        sampled, along_x, along_y = interpolate(d2[k], d2[k + right], d2[k + below], d2[k + right + below], fx[i], fy[i])
+        sampled, along_x, along_y = interpolate(d2[k], d2[k + right], d2[k + below], d2[k + right + below], fx[i],
+                                                fy[i])
         value, slope = penalty(d1[i] + change[i] - sampled, eps)
         keep = weight if visible[i] else zero
         slope = keep * slope
@@ -45,8 +47,8 @@ def _coupling_row(d1: np.ndarray, d2: np.ndarray, change: np.ndarray, u: np.ndar
 
 
 @rowwise
-def coupling_band(state: np.ndarray, d2: np.ndarray, visible: np.ndarray, weight: float, eps: float, first: int, last: int,
-                  loss: np.ndarray, gradient: np.ndarray, index: np.ndarray, parts: np.ndarray) -> None:
+def coupling_band(state: np.ndarray, d2: np.ndarray, visible: np.ndarray, weight: float, eps: float, first: int,
+                  last: int, loss: np.ndarray, gradient: np.ndarray, index: np.ndarray, parts: np.ndarray) -> None:
     """Add the term of rows `first` to `last` (excluded) and its gradient by D1, C, u, v.
 
     Parameters

@@ -1,7 +1,8 @@
 """Photometric term: structural similarity and absolute difference of an image and a warped one.
 
-``pe(a, b) = alpha clip((1 - SSIM(a, b)) / 2, 0, 1) + (1 - alpha) rho(a - b)``, mean over channels, where b(p) is the source
-sampled bilinearly at p + d(p). With the means over 3 x 3 pixels ``ma, mb, maa, mbb, mab`` of a, b, a^2, b^2 and a b::
+``pe(a, b) = alpha clip((1 - SSIM(a, b)) / 2, 0, 1) + (1 - alpha) rho(a - b)``, mean over channels, where b(p) is the
+source sampled bilinearly at p + d(p). With the means over 3 x 3 pixels ``ma, mb, maa, mbb, mab`` of a, b, a^2, b^2 and
+a b::
 
     SSIM = (2 ma mb + C1) (2 (mab - ma mb) + C2) / ((ma^2 + mb^2 + C1) (maa - ma^2 + mbb - mb^2 + C2))
 
@@ -12,8 +13,8 @@ mab, the derivative of the sum by one warped pixel *gathers* from its neighbours
 
     dE / db(q) = M^T[P](q) + 2 b(q) M^T[Q](q) + a(q) M^T[R](q) + (1 - alpha) rho'(b - a)
 
-and the chain rule with the sampler's derivative gives dE / dd. One pass streams over the rows: row y + 2 is warped, SSIM
-is taken at row y + 1, and row y receives its gradient, so that nothing larger than a few rows is ever stored.
+and the chain rule with the sampler's derivative gives dE / dd. One pass streams over the rows: row y + 2 is warped,
+SSIM is taken at row y + 1, and row y receives its gradient, so that nothing larger than a few rows is ever stored.
 
 Reference: Godard et al. 2017 (doi:10.1109/CVPR.2017.699); Wang et al. 2004 (doi:10.1109/TIP.2003.819861).
 """
@@ -51,7 +52,8 @@ def ssim(ma: float, mb: float, maa: float, mbb: float, mab: float, c1: float, c2
 def window_overlap(size: int, dtype: np.dtype | type) -> np.ndarray:
     """``(3, size)``: how often the reflected 3-windows of pixels q - 1, q and q + 1 hold pixel q.
 
-    1 each inside; 0 where there is no such pixel, 2 where a window reflects onto q. The adjoint of the mean in one axis.
+    1 each inside; 0 where there is no such pixel, 2 where a window reflects onto q. The adjoint of the mean in one
+    axis.
     """
     counts = np.zeros((3, size), dtype)
     for p in range(size):
@@ -94,7 +96,7 @@ def _locate(dx: np.ndarray, dy: np.ndarray | None, sign: float, y: int, shape: t
 def _warp(source: np.ndarray, vertical: np.ndarray | None, index: np.ndarray, fx: np.ndarray, fy: np.ndarray,
           in_x: np.ndarray, in_y: np.ndarray, right: int, below: int, b: np.ndarray, slope_x: np.ndarray,
           slope_y: np.ndarray) -> None:
-    """Sample one row of one channel: b, and its derivatives along x and y. `right`, `below`: steps to the neighbours."""
+    """Sample one row of one channel: b, and its derivatives along x and y. `right`, `below`: steps."""
     for i in range(index.size):
         k = np.uint32(index[i])
         v00, v01 = source[k], source[k + right]
@@ -111,12 +113,14 @@ def _warp(source: np.ndarray, vertical: np.ndarray | None, index: np.ndarray, fx
 @scalar
 def _column(a0: float, a1: float, a2: float, b0: float, b1: float, b2: float) -> tuple[float, ...]:
     """Sums over one column of three pixels: of a, b, a^2, b^2 and a b."""
-    return a0 + a1 + a2, b0 + b1 + b2, a0 * a0 + a1 * a1 + a2 * a2, b0 * b0 + b1 * b1 + b2 * b2, a0 * b0 + a1 * b1 + a2 * b2
+    return (a0 + a1 + a2, b0 + b1 + b2,
+            a0 * a0 + a1 * a1 + a2 * a2, b0 * b0 + b1 * b1 + b2 * b2, a0 * b0 + a1 * b1 + a2 * b2)
 
 
 @rowwise
 def _error(a0: np.ndarray, a1: np.ndarray, a2: np.ndarray, b0: np.ndarray, b1: np.ndarray, b2: np.ndarray,
-           keep: np.ndarray, alpha: float, eps: float, loss: np.ndarray, p: np.ndarray, q: np.ndarray, r: np.ndarray) -> None:
+           keep: np.ndarray, alpha: float, eps: float, loss: np.ndarray, p: np.ndarray, q: np.ndarray,
+           r: np.ndarray) -> None:
     """Add one row's error to `loss`; P, Q and R of every pixel, times its weight in the energy.
 
     The sums of the two columns before the newest are carried along, which LLVM keeps in vector registers.
@@ -143,10 +147,11 @@ def _error(a0: np.ndarray, a1: np.ndarray, a2: np.ndarray, b0: np.ndarray, b1: n
 
 @rowwise
 def _gradient(p0: np.ndarray, p1: np.ndarray, p2: np.ndarray, q0: np.ndarray, q1: np.ndarray, q2: np.ndarray,
-              r0: np.ndarray, r1: np.ndarray, r2: np.ndarray, above: float, here: float, below: float, overlap: np.ndarray,
-              a: np.ndarray, b: np.ndarray, slope_x: np.ndarray, slope_y: np.ndarray, vertical: np.ndarray | None,
-              keep: np.ndarray, sign: float, beta: float, eps: float, grad_x: np.ndarray, grad_y: np.ndarray) -> None:
-    """Add one row and channel of dE / dd; weights `above`, `here`, `below` and `overlap` as in :func:`window_overlap`."""
+              r0: np.ndarray, r1: np.ndarray, r2: np.ndarray, above: float, here: float, below: float,
+              overlap: np.ndarray, a: np.ndarray, b: np.ndarray, slope_x: np.ndarray, slope_y: np.ndarray,
+              vertical: np.ndarray | None, keep: np.ndarray, sign: float, beta: float, eps: float, grad_x: np.ndarray,
+              grad_y: np.ndarray) -> None:
+    """Add one row and channel of dE / dd; the four weights are those of :func:`window_overlap`."""
     lp, mp = above * p0[0] + here * p1[0] + below * p2[0], above * p0[1] + here * p1[1] + below * p2[1]
     lq, mq = above * q0[0] + here * q1[0] + below * q2[0], above * q0[1] + here * q1[1] + below * q2[1]
     lr, mr = above * r0[0] + here * r1[0] + below * r2[0], above * r0[1] + here * r1[1] + below * r2[1]

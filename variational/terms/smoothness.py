@@ -1,7 +1,7 @@
 """Smoothness term: first differences of every channel, cheap across the edges of its own image.
 
-``rho(d_x f) exp(-k mean_c |d_x I|) + rho(d_y f) exp(-k mean_c |d_y I|)`` with forward differences, in pixels, zero across the
-last column and row; I is left2 for D2, left1 for the others, k the edge sharpness (1 in the paper).
+``rho(d_x f) exp(-k mean_c |d_x I|) + rho(d_y f) exp(-k mean_c |d_y I|)`` with forward differences, in pixels, zero
+across the last column and row; I is left2 for D2, left1 for the others, k the edge sharpness (1 in the paper).
 
 Gradient: minus the divergence. A pixel gets its own forward differences' slopes with a minus and those of its left and
 upper neighbours with a plus, so rows are independent.
@@ -66,5 +66,5 @@ def smoothness_band(plane: np.ndarray, edges: np.ndarray, weight: float, eps: fl
         above, below = max(y - 1, 0), min(y + 1, height - 1)
         edge_above = edges[1, y - 1] if y > 0 else edges[1, height - 1]  # the last row's weights are zero
         _along_row(plane[y], edges[0, y], kind(weight), kind(eps), loss[y], flux)
-        _between_rows(plane[above], plane[y], plane[below], edge_above, edges[1, y], kind(weight), kind(eps), flux, loss[y],
-                      grad[y])
+        _between_rows(plane[above], plane[y], plane[below], edge_above, edges[1, y], kind(weight), kind(eps), flux,
+                      loss[y], grad[y])

@@ -1,8 +1,8 @@
 """Visibility: which pixels of an image are seen in the other, by checking that the way there leads back.
 
-Flow: ``O = [ |F + B'|^2 < w1 (|F|^2 + |B'|^2) + w2 ]``, B' the backward flow sampled bilinearly at p + F. w1 is relative,
-w2 in square pixels. O is a constant for differentiation. Reference: Sundaram et al. 2010 (doi:10.1007/978-3-642-15549-9_32),
-Meister et al. 2018 (UnFlow). Stereo: the same check with two disparity maps.
+Flow: ``O = [ |F + B'|^2 < w1 (|F|^2 + |B'|^2) + w2 ]``, B' the backward flow sampled bilinearly at p + F. w1 is
+relative, w2 in square pixels. O is a constant for differentiation. Reference: Sundaram et al. 2010
+(doi:10.1007/978-3-642-15549-9_32), Meister et al. 2018 (UnFlow). Stereo: the same check with two disparity maps.
 """
 
 import numpy as np
