@@ -7,8 +7,8 @@
     root/Adirondack-perfect/calib.txt             cam0=[f 0 cx; 0 f cy; 0 0 1], doffs (px), baseline (mm), ...
 
 There is one moment only, the second pair of a sample is the first again, with zero flow. The principal points of the
-two cameras differ by ``doffs``; depth is then ``f baseline / (disparity + doffs)``, which is no `Calibration`: a scene has
-one only where ``doffs`` is 0.
+two cameras differ by ``doffs``; depth is then ``f baseline / (disparity + doffs)``, which is no `Calibration`: a scene
+has one only where ``doffs`` is 0.
 """
 
 import re

@@ -81,9 +81,7 @@ def _about(frame: int, family: str, seed: int, size: tuple[int, int], options: d
     return {"family": family, "seed": seed + frame, "height": size[0], "width": size[1], "options": options}
 
 
-def _write_frame(
-    frame: int, training: Path, family: str, seed: int, size: tuple[int, int], options: dict[str, Any]
-) -> int:
+def _write_frame(frame: int, training: Path, family: str, seed: int, size: tuple[int, int], options: dict[str, Any]) -> int:
     sample = make_sample(family, seed + frame, *size, **options)
     write_frame(training, f"{frame:06d}", sample)
     about = _about(frame, family, seed, size, options)
@@ -96,9 +94,7 @@ def write_frame(training: Path, frame: str, sample: Sample) -> None:
     truth = sample.truth
     if truth is None or truth.disparity1 is None or truth.disparity2 is None or truth.flow is None:
         raise InputError(f"{sample.name}: has no complete truth to write")
-    for name, image in zip(
-        ("image_2/{}_10", "image_3/{}_10", "image_2/{}_11", "image_3/{}_11"), sample.images, strict=True
-    ):
+    for name, image in zip(("image_2/{}_10", "image_3/{}_10", "image_2/{}_11", "image_3/{}_11"), sample.images, strict=True):
         write_png(training / f"{name.format(frame)}.png", to_bytes(image))
     with np.errstate(invalid="ignore"):
         fits = np.abs(truth.flow).max(-1) <= _LARGEST_FLOW
@@ -108,15 +104,9 @@ def write_frame(training: Path, frame: str, sample: Sample) -> None:
         ("noc", (truth.visible_stereo, truth.visible_change, truth.visible_flow)),
     ):
         stereo, change, motion = (everywhere if mask is None else mask for mask in visible)
-        kitti_png.write_disparity(
-            training / f"disp_{kind}_0/{frame}_10.png", np.where(stereo, truth.disparity1, np.nan)
-        )
-        kitti_png.write_disparity(
-            training / f"disp_{kind}_1/{frame}_10.png", np.where(change, truth.disparity2, np.nan)
-        )
-        kitti_png.write_flow(
-            training / f"flow_{kind}/{frame}_10.png", np.where((motion & fits)[..., None], truth.flow, np.nan)
-        )
+        kitti_png.write_disparity(training / f"disp_{kind}_0/{frame}_10.png", np.where(stereo, truth.disparity1, np.nan))
+        kitti_png.write_disparity(training / f"disp_{kind}_1/{frame}_10.png", np.where(change, truth.disparity2, np.nan))
+        kitti_png.write_flow(training / f"flow_{kind}/{frame}_10.png", np.where((motion & fits)[..., None], truth.flow, np.nan))
     if truth.objects is not None:
         write_png(training / f"obj_map/{frame}_10.png", np.minimum(truth.objects, 255).astype(np.uint8))
     if sample.calibration is not None:

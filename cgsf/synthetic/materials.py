@@ -22,9 +22,7 @@ def recolored(rng: np.random.Generator) -> np.ndarray:
 def tinted(bgr: np.ndarray, texture_share: float = 0.3) -> np.ndarray:
     """The colour change (3, 4) that turns any texture into `bgr` (3,) with a grey trace of the texture."""
     bgr = np.asarray(bgr, float)
-    return np.concatenate(
-        [np.repeat(bgr[:, None] * 2 * texture_share / 3, 3, 1), bgr[:, None] * (1 - texture_share)], 1
-    )
+    return np.concatenate([np.repeat(bgr[:, None] * 2 * texture_share / 3, 3, 1), bgr[:, None] * (1 - texture_share)], 1)
 
 
 def finish(rng: np.random.Generator) -> dict[str, float]:
@@ -98,9 +96,7 @@ def foliage(source: TextureSource) -> Material:
     tint = np.array([rng.uniform(0.4, 0.9), 1.0, rng.uniform(0.5, 1.1)]) * rng.uniform(0.5, 1.2)
     if rng.random() < 0.15:
         tint = np.array([0.5, rng.uniform(0.6, 0.9), 1.3])
-    return Material(
-        source.kind("foliage"), np.eye(3, 4) * tint[:, None], rng.uniform(0.7, 1.6), 0.0, tuple(rng.random(2))
-    )
+    return Material(source.kind("foliage"), np.eye(3, 4) * tint[:, None], rng.uniform(0.7, 1.6), 0.0, tuple(rng.random(2)))
 
 
 class Wardrobe:

@@ -40,9 +40,7 @@ class Mesh:
     def moved(self, translation: ArrayLike = (0, 0, 0), rotation: Rotation | None = None) -> "Mesh":
         """The mesh rotated about its origin, then shifted by `translation` metres."""
         turn = np.eye(3) if rotation is None else rotation.as_matrix()
-        return replace(
-            self, points=self.points @ turn.T + np.asarray(translation, float), normals=self.normals @ turn.T
-        )
+        return replace(self, points=self.points @ turn.T + np.asarray(translation, float), normals=self.normals @ turn.T)
 
     def scaled(self, scale: ArrayLike) -> "Mesh":
         """The mesh stretched along the axes by positive factors; texture coordinates keep metres if it is one."""
@@ -203,9 +201,7 @@ def hull(points: np.ndarray) -> Mesh:
     return join(meshes)
 
 
-def sweep(
-    profile: Callable[[np.ndarray, np.ndarray], np.ndarray], rings: int, steps: int, uv_size: tuple[float, float]
-) -> Mesh:
+def sweep(profile: Callable[[np.ndarray, np.ndarray], np.ndarray], rings: int, steps: int, uv_size: tuple[float, float]) -> Mesh:
     """A closed surface ``profile(s, t) -> (..., 3)`` for s in [0, 1] (rings) and t in [0, 1] (round), outwards.
 
     The texture is stretched over `uv_size` metres along s and round t.
@@ -233,9 +229,7 @@ def ellipsoid(radii: ArrayLike, rings: int = 14, steps: int = 24, power: float =
 
         latitude, longitude = np.pi * (s - 0.5), 2 * np.pi * t
         around = shape(np.cos(latitude))
-        unit = np.stack(
-            [around * shape(np.cos(longitude)), shape(np.sin(latitude)), around * shape(np.sin(longitude))], -1
-        )
+        unit = np.stack([around * shape(np.cos(longitude)), shape(np.sin(latitude)), around * shape(np.sin(longitude))], -1)
         unit[..., -1, :] = unit[..., 0, :]
         if bumps is not None:
             waves = sum(wave[4] * np.sin(unit @ wave[:3] * wave[3] + index) for index, wave in enumerate(bumps))
@@ -251,9 +245,7 @@ def torus(radius: float, tube: float, rings: int = 14, steps: int = 28) -> Mesh:
 
     def profile(s: np.ndarray, t: np.ndarray) -> np.ndarray:
         across = radius + tube * np.cos(2 * np.pi * s)
-        return np.stack(
-            [across * np.cos(2 * np.pi * t), tube * np.sin(2 * np.pi * s), across * np.sin(2 * np.pi * t)], -1
-        )
+        return np.stack([across * np.cos(2 * np.pi * t), tube * np.sin(2 * np.pi * s), across * np.sin(2 * np.pi * t)], -1)
 
     return sweep(profile, rings, steps, (2 * np.pi * tube, 2 * np.pi * radius))
 
@@ -272,9 +264,7 @@ def lathe(outline: np.ndarray, steps: int = 20) -> Mesh:
         length = float(np.linalg.norm(pair[1] - pair[0]))
         if length < 1e-9:
             continue
-        points = np.stack(
-            [pair[:, :1] * np.cos(angle), np.repeat(pair[:, 1:], steps + 1, 1), pair[:, :1] * np.sin(angle)], -1
-        )
+        points = np.stack([pair[:, :1] * np.cos(angle), np.repeat(pair[:, 1:], steps + 1, 1), pair[:, :1] * np.sin(angle)], -1)
         turns = np.linspace(0, 2 * np.pi * max(pair[:, 0].max(), 1e-3), steps + 1)
         uv = np.stack(np.broadcast_arrays(turns[None, :], np.array([[travelled], [travelled + length]])), -1)
         bands.append(grid(points, uv))
@@ -334,14 +324,10 @@ def extrude(outline: np.ndarray, thickness: float) -> Mesh:
     outline = np.asarray(outline, float)
     count, front, back = len(outline), outline - (0, 0, thickness / 2), outline + (0, 0, thickness / 2)
     lids = [polygon(front, outline[:, :2]), polygon(back[::-1], outline[::-1, :2])]
-    sides = [
-        polygon(np.stack([front[i], front[(i + 1) % count], back[(i + 1) % count], back[i]])) for i in range(count)
-    ]
+    sides = [polygon(np.stack([front[i], front[(i + 1) % count], back[(i + 1) % count], back[i]])) for i in range(count)]
     signed = np.sum(outline[:, 0] * np.roll(outline[:, 1], -1) - np.roll(outline[:, 0], -1) * outline[:, 1])
     if signed > 0:  # one order of the corners, so that all faces look outwards together
         lids = [polygon(front[::-1], outline[::-1, :2]), polygon(back, outline[:, :2])]
     else:
-        sides = [
-            polygon(np.stack([back[i], back[(i + 1) % count], front[(i + 1) % count], front[i]])) for i in range(count)
-        ]
+        sides = [polygon(np.stack([back[i], back[(i + 1) % count], front[(i + 1) % count], front[i]])) for i in range(count)]
     return _outwards(join([*lids, *sides]))

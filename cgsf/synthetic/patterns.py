@@ -63,9 +63,7 @@ def _cells(rng: np.random.Generator, size: int, count: int) -> tuple[np.ndarray,
     """Nearest two of `count` random points on a torus: distances (S, S, 2) in their spacing, index, the points."""
     side = max(2, round(np.sqrt(count)))
     jitter = rng.uniform(0.0, 1.0) * (rng.random((side, side, 2)) - 0.5)
-    points = (
-        (np.stack(np.meshgrid(np.arange(side), np.arange(side), indexing="ij"), -1) + 0.5 + jitter) / side
-    ).reshape(-1, 2)
+    points = ((np.stack(np.meshgrid(np.arange(side), np.arange(side), indexing="ij"), -1) + 0.5 + jitter) / side).reshape(-1, 2)
     pixels = np.stack(np.meshgrid(np.arange(size), np.arange(size), indexing="ij"), -1).reshape(-1, 2) / size
     distance, index = cKDTree(points % 1.0, boxsize=1.0).query(pixels, k=2)
     return distance.reshape(size, size, 2) * side, index[:, 0].reshape(size, size), points
@@ -113,9 +111,7 @@ def foliage(rng: np.random.Generator, size: int) -> np.ndarray:
     image = np.full((size, size, 3), 0.5) * hue * 0.5
     spread, mean_angle = rng.uniform(10, 180), rng.random() * 180
     for step in range(900):
-        shade = np.clip(
-            hue * (0.25 + 1.1 * step / 900 * rng.uniform(0.5, 1.2)) + 0.05 * rng.standard_normal(3), 0, 1
-        ).tolist()
+        shade = np.clip(hue * (0.25 + 1.1 * step / 900 * rng.uniform(0.5, 1.2)) + 0.05 * rng.standard_normal(3), 0, 1).tolist()
         centre = rng.random(2) * size
         axes = (int(rng.integers(4, 13)), int(rng.integers(2, 5)))
         angle = mean_angle + spread * (rng.random() - 0.5)
@@ -279,9 +275,7 @@ def facade(rng: np.random.Generator, size: int) -> np.ndarray:
     if rng.random() < 0.5:
         for row in range(rows):  # a cornice between the floors
             y = int(row * size / rows)
-            cv2.rectangle(
-                image, (0, y), (size, y + max(2, size // 60)), (wall * rng.uniform(0.6, 1.2)).clip(0, 1).tolist(), -1
-            )
+            cv2.rectangle(image, (0, y), (size, y + max(2, size // 60)), (wall * rng.uniform(0.6, 1.2)).clip(0, 1).tolist(), -1)
     return np.clip(image, 0, 1)
 
 

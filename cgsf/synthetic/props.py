@@ -123,9 +123,7 @@ def car(rng: np.random.Generator) -> Prop:
 
     def slab(*levels: tuple[float, float, float, float]) -> Mesh:
         """Hull of rectangles (height, half width, z from, z to)."""
-        return hull(
-            np.array([(side * w, -y, end) for y, w, rear, front in levels for side in (-1, 1) for end in (rear, front)])
-        )
+        return hull(np.array([(side * w, -y, end) for y, w, rear, front in levels for side in (-1, 1) for end in (rear, front)]))
 
     dip = rng.uniform(0.02, 0.12)
     lower = slab(
@@ -162,9 +160,7 @@ def car(rng: np.random.Generator) -> Prop:
         Piece("dark", box((width * 0.8, 0.1, length * 0.9)).moved((0, -clear, 0))),
         Piece("plate", boxes((0.52, 0.12, 0.05), [(0, -0.5, end + 0.03 * np.sign(end)) for end, _ in ends])),
     ]  # fmt: skip
-    pieces += [
-        Piece(name, boxes(lamp_size, [(s * (x - 0.26), -lamp_height, end) for s in (-1, 1)])) for end, name in ends
-    ]
+    pieces += [Piece(name, boxes(lamp_size, [(s * (x - 0.26), -lamp_height, end) for s in (-1, 1)])) for end, name in ends]
     radius = rng.uniform(0.29, 0.36)
     for side in (-1, 1):
         for axle in (-z + 0.75, z - 0.8):
@@ -178,15 +174,9 @@ def truck(rng: np.random.Generator) -> Prop:
     length, width, height = rng.uniform(5.5, 12), rng.uniform(2.1, 2.5), rng.uniform(2.4, 3.6)
     low, high = rng.uniform(0.4, 0.6), min(height, rng.uniform(2.2, 3.0))
     nose = np.array(
-        [
-            (s * width * 0.48, -y, z)
-            for s in (-1, 1)
-            for y, z in ((low, 0), (low, 1.75), (1.3, 1.8), (high, 1.5), (high, 0))
-        ]
+        [(s * width * 0.48, -y, z) for s in (-1, 1) for y, z in ((low, 0), (low, 1.75), (1.3, 1.8), (high, 1.5), (high, 0))]
     )
-    pane = box((width * 0.9, 0.35 * high, 0.05)).moved(
-        (0, -0.72 * high, length / 2 - 0.14), Rotation.from_rotvec((-0.2, 0, 0))
-    )
+    pane = box((width * 0.9, 0.35 * high, 0.05)).moved((0, -0.72 * high, length / 2 - 0.14), Rotation.from_rotvec((-0.2, 0, 0)))
     lamps = [(s * (width / 2 - 0.25), -0.85, -length / 2) for s in (-1, 1)]
     pieces = [
         Piece("load", box((width, height - 0.9, length - 1.8)).moved((0, -(height + 0.9) / 2, -0.9))),
@@ -212,9 +202,7 @@ def _human(rng: np.random.Generator, riding: bool) -> list[Piece]:
     pieces = [
         Piece(
             "coat",
-            ellipsoid((rng.uniform(0.18, 0.25), 0.17 * tall, rng.uniform(0.11, 0.16)), 8, 12, 0.8).moved(
-                (0, -chest, 0)
-            ),
+            ellipsoid((rng.uniform(0.18, 0.25), 0.17 * tall, rng.uniform(0.11, 0.16)), 8, 12, 0.8).moved((0, -chest, 0)),
         ),
         Piece("skin", ellipsoid((0.085, 0.12, 0.1), 8, 10).moved((0, -head, 0))),
         Piece("hair", ellipsoid((0.095, 0.07, 0.11), 6, 10).moved((0, -head - 0.04 * tall, -0.01))),
@@ -248,11 +236,10 @@ def cyclist(rng: np.random.Generator) -> Prop:
     """A rider on two thin wheels."""
     angle = np.linspace(0, 2 * np.pi, 21)
     angle[-1] = 0.0
-    rings = [
-        np.stack([np.zeros(21), 0.33 * np.sin(angle) - 0.34, 0.33 * np.cos(angle) + axle], -1) for axle in (-0.5, 0.55)
-    ]
+    rings = [np.stack([np.zeros(21), 0.33 * np.sin(angle) - 0.34, 0.33 * np.cos(angle) + axle], -1) for axle in (-0.5, 0.55)]
     bars = ([(0, -0.34, -0.5), (0, -0.85, -0.15)], [(0, -0.34, 0.55), (0, -1.0, 0.4)],
-            [(0, -0.8, -0.15), (0, -0.8, 0.42)], [(0, -0.35, 0.0), (0, -0.8, 0.42)], [(-0.25, -1.02, 0.42), (0.25, -1.02, 0.42)])  # fmt: skip
+            [(0, -0.8, -0.15), (0, -0.8, 0.42)], [(0, -0.35, 0.0), (0, -0.8, 0.42)],
+            [(-0.25, -1.02, 0.42), (0.25, -1.02, 0.42)])  # fmt: skip
     pieces = _human(rng, riding=True)
     pieces.append(Piece("dark", join([tube(ring, 0.025, 5) for ring in rings])))
     pieces.append(Piece("rim", join([tube(np.array(bar, float), 0.022, 5) for bar in bars])))
@@ -274,9 +261,7 @@ def _leaf_cloud(rng: np.random.Generator, count: int, radii: np.ndarray, size: f
     extent = size * rng.uniform(0.5, 1.4, (count, 1))
     a, b = first * extent, second * extent * 0.6
     points = np.stack([middle - a, middle + b, middle + a, middle - a, middle + a, middle - b], 1).reshape(-1, 3, 3)
-    uv = np.tile(
-        np.array([(-1, 0), (0, 0.6), (1, 0), (-1, 0), (1, 0), (0, -0.6)]).reshape(2, 3, 2) * size, (count, 1, 1)
-    )
+    uv = np.tile(np.array([(-1, 0), (0, 0.6), (1, 0), (-1, 0), (1, 0), (0, -0.6)]).reshape(2, 3, 2) * size, (count, 1, 1))
     uv = uv + np.repeat(rng.random((count, 1, 2)) * 3, 2, axis=0)
     return Mesh(points, np.repeat(np.repeat(direction[:, None], 3, 1), 2, 0), uv, np.repeat(np.arange(count), 2))
 
@@ -292,18 +277,14 @@ def _lump(rng: np.random.Generator, radii: np.ndarray, middle: np.ndarray, leave
 def tree(rng: np.random.Generator) -> Prop:
     """A trunk with branches and a crown of leaves, 4 to 10 m tall."""
     height, trunk, girth = rng.uniform(4, 10), rng.uniform(1.6, 3.2), rng.uniform(0.08, 0.22)
-    pieces = [
-        Piece("bark", lathe(np.array([[girth * 1.3, 0.0], [girth, -trunk * 0.4], [girth * 0.6, -trunk - 1.0]]), 9))
-    ]
+    pieces = [Piece("bark", lathe(np.array([[girth * 1.3, 0.0], [girth, -trunk * 0.4], [girth * 0.6, -trunk - 1.0]]), 9))]
     crown, spread = np.array([0, -(trunk + (height - trunk) / 2), 0]), (height - trunk) * rng.uniform(0.28, 0.5)
     for _ in range(int(rng.integers(2, 5))):
         branch = crown + rng.standard_normal(3) * spread * (0.5, 0.4, 0.5)
         pieces.append(Piece("bark", tube(np.array([(0, -trunk * 0.8, 0), branch]), girth * 0.35, 5)))
     for _ in range(int(rng.integers(3, 6))):
         middle = crown + rng.standard_normal(3) * spread * (0.5, 0.45, 0.5)
-        lump = _lump(
-            rng, spread * rng.uniform(0.5, 0.95, 3), middle, int(rng.integers(120, 300)), rng.uniform(0.09, 0.2)
-        )
+        lump = _lump(rng, spread * rng.uniform(0.5, 0.95, 3), middle, int(rng.integers(120, 300)), rng.uniform(0.09, 0.2))
         pieces += lump if rng.random() < 0.85 else lump[1:]
     return tuple(pieces)
 

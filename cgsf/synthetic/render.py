@@ -189,9 +189,7 @@ def make_scene(family: str, seed: int, height: int, width: int, config: RenderCo
     if height < 16 or width < 16:
         raise InputError(f"images must be at least 16 x 16 pixels, got {height} x {width}")
     rng = np.random.default_rng([sorted(FAMILIES).index(family), seed])
-    source = TextureSource(
-        np.random.default_rng([sorted(FAMILIES).index(family), seed, 1]), config.photos, config.photo_share
-    )
+    source = TextureSource(np.random.default_rng([sorted(FAMILIES).index(family), seed, 1]), config.photos, config.photo_share)
     return FAMILIES[family](rng, source, height, width)
 
 
@@ -223,9 +221,7 @@ def make_video(family: str, seed: int, height: int, width: int, frames: int, **o
     """
     unknown = set(options) - {field.name for field in fields(RenderConfig)}
     if unknown:
-        raise InputError(
-            f"unknown option {sorted(unknown)[0]!r}; known are {', '.join(f.name for f in fields(RenderConfig))}"
-        )
+        raise InputError(f"unknown option {sorted(unknown)[0]!r}; known are {', '.join(f.name for f in fields(RenderConfig))}")
     if frames < 2:
         raise InputError(f"a video has at least 2 frames, got {frames}")
     config = RenderConfig(**options)
@@ -241,8 +237,7 @@ def make_video(family: str, seed: int, height: int, width: int, frames: int, **o
         left, right, left_radiance, right_radiance = renderer.exposed(float(frame))
         scale = scale or sensor.scale(left_radiance)
         images = [
-            sensor.develop(radiance, scale, side, frame, rng)
-            for side, radiance in enumerate((left_radiance, right_radiance))
+            sensor.develop(radiance, scale, side, frame, rng) for side, radiance in enumerate((left_radiance, right_radiance))
         ]
         if before is not None:
             truth = truth_of(renderer, before[0], before[1], left, right)

@@ -316,9 +316,5 @@ def _place(
         m = places[part[n]]
         for c in range(3):
             for i in range(3):
-                points_out[n, c, i] = (
-                    m[i, 0] * points[n, c, 0] + m[i, 1] * points[n, c, 1] + m[i, 2] * points[n, c, 2] + m[i, 3]
-                )
-                normals_out[n, c, i] = (
-                    m[i, 0] * normals[n, c, 0] + m[i, 1] * normals[n, c, 1] + m[i, 2] * normals[n, c, 2]
-                )
+                points_out[n, c, i] = m[i, 0] * points[n, c, 0] + m[i, 1] * points[n, c, 1] + m[i, 2] * points[n, c, 2] + m[i, 3]
+                normals_out[n, c, i] = m[i, 0] * normals[n, c, 0] + m[i, 1] * normals[n, c, 1] + m[i, 2] * normals[n, c, 2]

@@ -55,9 +55,7 @@ class Sensor:
             exposure=rng.uniform(0.32, 0.58),
             gamma=rng.uniform(0.4, 0.65),
             grey=bool(rng.random() < 0.12),
-            gain=1
-            + rng.uniform(0, 0.06) * rng.standard_normal((2, 1))
-            + rng.uniform(0, 0.02) * rng.standard_normal((2, 3)),
+            gain=1 + rng.uniform(0, 0.06) * rng.standard_normal((2, 1)) + rng.uniform(0, 0.02) * rng.standard_normal((2, 3)),
             flicker=1 + 0.01 * rng.standard_normal(frames),
             vignetting=rng.uniform(0, 0.3) * float(rng.random() < 0.5),
             blur_px=rng.uniform(0.0, 0.8),
@@ -71,9 +69,7 @@ class Sensor:
         # pictures are judged on every fourth pixel
         return float((self.exposure / max(float(np.sqrt(radiance[::4, ::4].mean(-1)).mean()), 1e-6)) ** 2)
 
-    def develop(
-        self, radiance: np.ndarray, scale: float, camera: int, frame: int, rng: np.random.Generator
-    ) -> np.ndarray:
+    def develop(self, radiance: np.ndarray, scale: float, camera: int, frame: int, rng: np.random.Generator) -> np.ndarray:
         """The picture (H, W, 3) float32 in [0, 1] of `radiance` by camera 0 (left) or 1 (right)."""
         gain = np.ones(3) if self.gain is None else self.gain[camera]
         factor = scale * gain * (1.0 if self.flicker is None else self.flicker[frame])
@@ -91,9 +87,7 @@ class Sensor:
 
 
 @rowwise
-def _expose(
-    radiance: np.ndarray, factor: np.ndarray, vignetting: float, curve: np.ndarray, grey: bool, out: np.ndarray
-) -> None:
+def _expose(radiance: np.ndarray, factor: np.ndarray, vignetting: float, curve: np.ndarray, grey: bool, out: np.ndarray) -> None:
     """Gains, vignetting, clip and tone curve; `curve` (K,) is a table over the square root of the light."""
     height, width = radiance.shape[0], radiance.shape[1]
     last = curve.size - 2

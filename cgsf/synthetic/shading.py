@@ -52,9 +52,7 @@ def _texel(atlas: np.ndarray, place: int) -> np.int64:
 
 
 @rowwise
-def _level(
-    atlas: np.ndarray, start: int, size: int, mirrored: bool, u: float, v: float, weight: float, out: np.ndarray
-) -> None:
+def _level(atlas: np.ndarray, start: int, size: int, mirrored: bool, u: float, v: float, weight: float, out: np.ndarray) -> None:
     """Add `weight` times the bilinear value of one texture copy at (u, v) in repeats, pixel centres at halves."""
     x, y = u * size - 0.5, v * size - 0.5
     fx, fy = math.floor(x), math.floor(y)
@@ -104,9 +102,7 @@ def _texture(
 
 
 @rowwise
-def _sky(
-    atlas: np.ndarray, size: int, illumination: np.ndarray, dx: float, dy: float, dz: float, out: np.ndarray
-) -> None:
+def _sky(atlas: np.ndarray, size: int, illumination: np.ndarray, dx: float, dy: float, dz: float, out: np.ndarray) -> None:
     """Radiance (3,) from direction (dx, dy, dz), unit length, y down; the clouds are the atlas's first texture."""
     light = illumination[0]
     if dy > 0.0:  # below the horizon: the ground's mean colour, for mirrors
@@ -156,12 +152,7 @@ def find_edges(hit: np.ndarray, inverse_depth: np.ndarray, surface: np.ndarray, 
                 y, x = row + down, column + right
                 if y < height and x < width and hit[y, x] != here:
                     there, other = hit[y, x], inverse_depth[y, x]
-                    if (
-                        here < 0
-                        or there < 0
-                        or surface[here] != surface[there]
-                        or abs(near - other) > 0.1 * max(near, other)
-                    ):
+                    if here < 0 or there < 0 or surface[here] != surface[there] or abs(near - other) > 0.1 * max(near, other):
                         edge[row, column] = edge[y, x] = True
 
 
@@ -289,9 +280,7 @@ def shade(
             fade = min(1.0, 2.0 - texels / 64.0)  # far away the fine texture is below the pixel
             if fade > 0.0:
                 work[0] = work[1] = work[2] = 0.0
-                _texture(
-                    atlas, texture.start, texture.size, texture.mirrored, u * fine, v * fine, texels, False, 1.0, work
-                )
+                _texture(atlas, texture.start, texture.size, texture.mirrored, u * fine, v * fine, texels, False, 1.0, work)
                 grain = max(1.0 + fade * material.detail_strength * (2.0 * work[1] - 1.0), 0.0)
 
         # light

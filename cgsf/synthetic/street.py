@@ -23,15 +23,13 @@ _FAR_M = 180.0
 def street(rng: np.random.Generator, source: TextureSource, height: int, width: int) -> Scene:
     """A scene of the family `street`; see the module."""
     focal = 0.58 * width * rng.uniform(0.94, 1.06)
-    camera = StereoCamera(focal, focal, 0.491 * width, 0.461 * height, rng.uniform(0.50, 0.58))
+    camera = StereoCamera(focal, focal, 0.491 * width - 0.5, 0.461 * height - 0.5, rng.uniform(0.50, 0.58))
     half_road = rng.uniform(2.8, 6.5)
     lane = rng.uniform(0.2, 0.75) * half_road
     eye = np.array([lane if rng.random() < 0.85 else -lane, -rng.uniform(1.45, 1.85), 0.0])
     turning = rng.random() < 0.3
     speed = float(
-        rng.choice(
-            [0.0, rng.uniform(0.05, 0.4), rng.uniform(0.3, 1.1), rng.uniform(0.9, 1.7)], p=[0.08, 0.25, 0.5, 0.17]
-        )
+        rng.choice([0.0, rng.uniform(0.05, 0.4), rng.uniform(0.3, 1.1), rng.uniform(0.9, 1.7)], p=[0.08, 0.25, 0.5, 0.17])
     )
     yaw_rate = rng.normal(0, 0.025) if turning else rng.normal(0, 0.004)
     heading = rng.normal(0, 0.25) if turning else rng.normal(0, 0.05)
@@ -109,23 +107,17 @@ def _ground(
         if urban
         else upright(source, rng.uniform(1.5, 3.0), "foliage", recolor=False)
     )
-    behind = upright(
-        source, rng.uniform(1.5, 4.0), *(("grain", "masonry", "foliage") if urban else ("foliage",)), recolor=urban
-    )
+    behind = upright(source, rng.uniform(1.5, 4.0), *(("grain", "masonry", "foliage") if urban else ("foliage",)), recolor=urban)
     stone, step = paint(rng, np.full(3, rng.uniform(0.35, 0.75))), rng.uniform(0.06, 0.16) if urban else 0.02
     for side in (-1, 1):
         inner, outer = side * (half_road + 0.15), side * (half_road + pavement)
         scene.add(polygon(_flat(inner, outer, near, _FAR_M, -step)), walk)
-        scene.add(
-            box((0.15, 2 * step, _FAR_M - near)).moved((side * (half_road + 0.075), 0, (_FAR_M + near) / 2)), stone
-        )
+        scene.add(box((0.15, 2 * step, _FAR_M - near)).moved((side * (half_road + 0.075), 0, (_FAR_M + near) / 2)), stone)
         scene.add(polygon(_flat(outer, side * 90, near, _FAR_M, -step)), behind)
     white = paint(rng, np.full(3, rng.uniform(0.6, 0.95)))
     if rng.random() < 0.7:
         dash, gap = (rng.uniform(1.5, 6), rng.uniform(2, 8)) if rng.random() < 0.75 else (_FAR_M, 1.0)
-        dashes = [
-            polygon(_flat(-0.07, 0.07, z, min(z + dash, _FAR_M), -0.004)) for z in np.arange(near, 90, dash + gap)[:24]
-        ]
+        dashes = [polygon(_flat(-0.07, 0.07, z, min(z + dash, _FAR_M), -0.004)) for z in np.arange(near, 90, dash + gap)[:24]]
         scene.add(join(dashes), white)
     if rng.random() < 0.4:
         for side in (-1, 1):
@@ -238,9 +230,7 @@ def _windows(
         scene.add(boxes((0.06, 0.9, wide + 0.6), upper + (-side * 0.95, tall / 2 - 0.25, 0)), trim)
 
 
-def _green(
-    scene: Scene, rng: np.random.Generator, source: TextureSource, side: int, front: float, wardrobe: Wardrobe
-) -> None:
+def _green(scene: Scene, rng: np.random.Generator, source: TextureSource, side: int, front: float, wardrobe: Wardrobe) -> None:
     """Trees, hedges and banks in place of houses."""
     for z in np.arange(rng.uniform(2, 8), 80, rng.uniform(6, 14))[:9]:
         foot = (side * (front + rng.uniform(0, 8)), 0.0, z + rng.normal(0, 1.5))
@@ -332,9 +322,7 @@ def _traffic(scene: Scene, rng: np.random.Generator, wardrobe: Wardrobe, lane: f
         z += rng.uniform(8, 30)
     if rng.random() < 0.35:  # crossing
         way = int(rng.choice([-1, 1]))
-        add(
-            -way * rng.uniform(-3, 6), rng.uniform(9, 30), way * (np.pi / 2 + rng.normal(0, 0.2)), rng.uniform(0.2, 1.0)
-        )
+        add(-way * rng.uniform(-3, 6), rng.uniform(9, 30), way * (np.pi / 2 + rng.normal(0, 0.2)), rng.uniform(0.2, 1.0))
 
 
 def _people(

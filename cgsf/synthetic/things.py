@@ -61,9 +61,7 @@ def _vase(rng: np.random.Generator) -> Mesh:
 
 def _drum(rng: np.random.Generator) -> Mesh:
     radius = rng.uniform(0.15, 0.8)
-    return lathe(
-        np.array([[radius, -0.8], [radius * rng.choice([1, 1, 0.02, 0.5]), 0.8]]) * (1, rng.uniform(0.15, 1)), 24
-    )
+    return lathe(np.array([[radius, -0.8], [radius * rng.choice([1, 1, 0.02, 0.5]), 0.8]]) * (1, rng.uniform(0.15, 1)), 24)
 
 
 def _ring(rng: np.random.Generator) -> Mesh:
@@ -126,10 +124,10 @@ def _seat(rng: np.random.Generator) -> Mesh:
 def _cloth(rng: np.random.Generator) -> Mesh:
     """A waved sheet, seen from both sides."""
     a, b = np.meshgrid(np.linspace(-0.9, 0.9, 21), np.linspace(-0.9, 0.9, 21), indexing="ij")
-    depth: np.ndarray | float = sum(
-        0.25 / k * np.sin(k * (a * rng.normal() + b * rng.normal()) * 3 + rng.uniform(0, 6)) for k in range(1, 4)
-    )
-    return grid(np.stack([a, b, np.asarray(depth)], -1), np.stack([a, b], -1))
+    depth = np.zeros_like(a)
+    for k in range(1, 4):
+        depth += 0.25 / k * np.sin(k * (a * rng.normal() + b * rng.normal()) * 3 + rng.uniform(0, 6))
+    return grid(np.stack([a, b, depth], -1), np.stack([a, b], -1))
 
 
 def _letters(rng: np.random.Generator) -> Mesh:
@@ -149,7 +147,8 @@ def _letters(rng: np.random.Generator) -> Mesh:
 
 SHAPES: tuple[tuple[float, Callable[[np.random.Generator], Mesh]], ...] = (
     (3, _box), (1.5, _plate), (2, _stone), (1.5, _wedge), (1.5, _ball), (1.5, _pebble), (2.5, _blob), (1.5, _vase),
-    (2, _drum), (1, _ring), (1, _gear), (1, _knot), (0.8, _frame), (0.6, _lattice), (1.5, _seat), (1, _cloth), (0.8, _letters),
+    (2, _drum), (1, _ring), (1, _gear), (1, _knot), (0.8, _frame), (0.6, _lattice), (1.5, _seat),
+    (1, _cloth), (0.8, _letters),
 )  # fmt: skip
 _WEIGHTS = np.array([weight for weight, _ in SHAPES])
 
@@ -190,9 +189,7 @@ def things(rng: np.random.Generator, source: TextureSource, height: int, width: 
         np.array([0, 0, 0.6 * back_m]), 0.75 * back_m, tint * bright, back_m * rng.uniform(0.6, 2.0),
         tint * rng.uniform(0.15, 0.7), tint * rng.uniform(0.1, 0.5),
     )  # fmt: skip
-    sky = Sky(
-        tint * rng.uniform(0.3, 1.2), tint[::-1] * rng.uniform(0.2, 1.0), source.any("clouds"), rng.uniform(0.2, 1.0)
-    )
+    sky = Sky(tint * rng.uniform(0.3, 1.2), tint[::-1] * rng.uniform(0.2, 1.0), source.any("clouds"), rng.uniform(0.2, 1.0))
     scene = Scene(camera, path, light, sky)
     _room(scene, rng, source, back_m, focal, aspect)
 
@@ -214,9 +211,7 @@ def things(rng: np.random.Generator, source: TextureSource, height: int, width: 
     return scene
 
 
-def _room(
-    scene: Scene, rng: np.random.Generator, source: TextureSource, back_m: float, focal: float, aspect: float
-) -> None:
+def _room(scene: Scene, rng: np.random.Generator, source: TextureSource, back_m: float, focal: float, aspect: float) -> None:
     """Walls, floor and ceiling, turned against the camera, and things that stand on the floor."""
     turn = Rotation.from_rotvec(rng.uniform(-1, 1, 3) * (0.12, 0.5, 0.1))
     left, right = -rng.uniform(0.35, 0.9) * back_m / focal, rng.uniform(0.35, 0.9) * back_m / focal

@@ -11,6 +11,9 @@ import numpy as np
 from cgsf.synthetic.caster import NEAR_M, Caster
 from variational.jit import rowwise
 
+#: A point on the image's border stays inside in spite of rounding.
+_ROUNDING_PX = 1e-6
+
 
 class View(NamedTuple):
     """One camera at one moment.
@@ -70,9 +73,7 @@ def follow(source: View, target: View) -> tuple[np.ndarray, np.ndarray]:
     place, there = np.empty((*source.hit.shape, 2)), np.empty(source.hit.shape)
     caster = source.caster
     turn = target.caster.pose[:3, :3] @ caster.pose[:3, :3].T
-    _follow(
-        source.hit, source.inverse_depth, caster.plane, target.caster.corners, turn, caster.intrinsics, place, there
-    )
+    _follow(source.hit, source.inverse_depth, caster.plane, target.caster.corners, turn, caster.intrinsics, place, there)
     return place, there
 
 
@@ -81,5 +82,6 @@ def seen(target: View, place: np.ndarray, inverse_depth: np.ndarray) -> np.ndarr
     x, y = place[..., 0].ravel(), place[..., 1].ravel()
     nearest = target.caster.nearest(x, y)
     with np.errstate(invalid="ignore"):
-        inside = (x >= 0) & (y >= 0) & (x <= target.caster.width - 1) & (y <= target.caster.height - 1)
+        last_x, last_y = target.caster.width - 1, target.caster.height - 1
+        inside = (x >= -_ROUNDING_PX) & (y >= -_ROUNDING_PX) & (x <= last_x + _ROUNDING_PX) & (y <= last_y + _ROUNDING_PX)
         return (inside & (inverse_depth.ravel() >= nearest * (1 - 1e-6))).reshape(inverse_depth.shape)

@@ -82,10 +82,8 @@ def test_calibration_turns_truth_into_the_objects_rigid_motion() -> None:
         to_world = np.linalg.inv(scene.path.pose(0.0))
         motions = {0: np.eye(4)}
         for part in scene.parts:
-            if (
-                part.motion is not None
-                and np.ptp([p.motion is part.motion for p in scene.parts if p.object_id == part.object_id]) == 0
-            ):
+            whole = all(other.motion is part.motion for other in scene.parts if other.object_id == part.object_id)
+            if part.motion is not None and whole:
                 motions[part.object_id] = part.motion.pose(1.0)
         checked = 0
         for number, motion in motions.items():
@@ -182,9 +180,7 @@ def test_a_mirrored_world_gives_the_mirrored_pair() -> None:
     for part in scene.parts:
         mesh = part.mesh.moved(part.place[:3, 3])
         points = mesh.points[:, ::-1] * (-1, 1, 1) + (scene.camera.baseline_m, 0, 0)
-        mirrored.add(
-            replace(mesh, points=points, normals=mesh.normals[:, ::-1] * (-1, 1, 1), uv=mesh.uv[:, ::-1]), part.material
-        )
+        mirrored.add(replace(mesh, points=points, normals=mesh.normals[:, ::-1] * (-1, 1, 1), uv=mesh.uv[:, ::-1]), part.material)
     left, right, _, _ = Renderer(scene, HEIGHT, WIDTH, RenderConfig()).stereo(0.0)
     left_m, right_m, _, _ = Renderer(mirrored, HEIGHT, WIDTH, RenderConfig()).stereo(0.0)
     np.testing.assert_allclose(left_m.inverse_depth[:, ::-1], right.inverse_depth, rtol=1e-9)
