@@ -123,7 +123,7 @@ def test_visibility_equals_brute_force(family: str) -> None:
         hidden = 0
         for row, column in zip(rows, columns, strict=True):
             x, y = place[row, column]
-            inside = 0 <= x <= WIDTH - 1 and 0 <= y <= HEIGHT - 1
+            inside = -1e-6 <= x <= WIDTH - 1 + 1e-6 and -1e-6 <= y <= HEIGHT - 1 + 1e-6
             if not inside or inverse_depth[row, column] == 0:
                 assert inside or not mask[row, column]
                 continue
