@@ -116,8 +116,8 @@ def _seat(rng: np.random.Generator) -> Mesh:
             parts.append(box((leg, height, leg)).moved((x * (width - leg) / 2, height / 2, z * (depth - leg) / 2)))
     if rng.random() < 0.7:
         bars = int(rng.integers(1, 6))
-        for x in np.linspace(-1, 1, bars) * (width - leg) / 2 if bars > 1 else [0.0]:
-            parts.append(box((leg if bars > 1 else width, height, leg)).moved((x, -height / 2, (depth - leg) / 2)))
+        for place in np.linspace(-1, 1, bars) * (width - leg) / 2 if bars > 1 else [0.0]:
+            parts.append(box((leg if bars > 1 else width, height, leg)).moved((place, -height / 2, (depth - leg) / 2)))
     return join(parts)
 
 
