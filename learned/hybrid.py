@@ -1,0 +1,107 @@
+"""The loop over refinement steps, from whatever start, and the whole model: networks first, then the loop."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from learned.batch import Batch
+from learned.oracle import Oracle
+from learned.refiner import Refiner
+
+#: Called after each evaluation with the step t, the state X_t, the energy's map and gradient there (None if not
+#: needed).
+Watch = Callable[[int, Tensor, Tensor | None, Tensor | None], None]
+
+
+class Refinement(NamedTuple):
+    """The way of a refinement."""
+
+    states: list[Tensor]
+    """X_0 ... X_T, each (B, 5, H, W) in pixels."""
+    reliabilities: list[Tensor | None]
+    """Of X_0 ... X_{T-1}: logits (B, 2, h, w), if the refiner propagates."""
+
+
+def refine(
+    refiner: Refiner,
+    batch: Batch,
+    oracle: Oracle | None = None,
+    steps: int | None = None,
+    watch: Watch | None = None,
+) -> Refinement:
+    """T steps of G from the batch's start.
+
+    Energy and gradient enter as numbers that are not differentiated through (first order); the states are, through all
+    steps unless the refiner is configured otherwise.
+
+    Parameters
+    ----------
+    refiner : Refiner
+    batch : Batch
+        With a start; the backward flow (for the visible pixels of the energy) and the evidence belong to the start and
+        are held fixed.
+    oracle : Oracle or None
+        The energy; None takes the paper's.
+    steps : int or None
+        T; None takes the refiner's own.
+    watch : callable or None
+        Sees every state with its energy, the last one too.
+    """
+    if batch.start is None:
+        raise ValueError("there is no start to refine")
+    left1, _, left2, _ = batch.frames
+    images = torch.cat([left1, left2], 1) if refiner.config.needs_images else None
+    steps = refiner.config.steps if steps is None else steps
+    if oracle is None and (refiner.config.needs_energy or watch):
+        oracle = Oracle(*batch.frames, batch.backward_flow)
+    states, reliabilities = [batch.start], []
+    for t in range(steps + 1):
+        loss = gradient = None
+        if oracle is not None and (watch or (t < steps and refiner.config.needs_energy)):
+            loss, gradient = oracle.features(states[-1])
+        if watch:
+            watch(t, states[-1], loss, gradient)
+        if t < steps:
+            state = states[-1].detach() if refiner.config.detached else states[-1]
+            update = refiner(state, loss, gradient, images, batch.evidence)
+            states.append(state + update.change)
+            reliabilities.append(update.reliability)
+    return Refinement(states, reliabilities)
+
+
+@dataclass(frozen=True)
+class HybridConfig:
+    """How networks and refiner are joined."""
+
+    steps: int | None = None
+    """Refinement steps; None takes the refiner's own."""
+
+
+class Hybrid(nn.Module):
+    """X_0 = H(images), then T steps of G; trained jointly, or with H frozen.
+
+    Parameters
+    ----------
+    feedforward : nn.Module
+        H: ``(left1, right1, left2, right2) -> (state (B, 5, H, W), backward flow (B, 2, H, W))``.
+    refiner : Refiner
+        G.
+    """
+
+    def __init__(self, feedforward: nn.Module, refiner: Refiner, config: HybridConfig = HybridConfig()) -> None:
+        super().__init__()
+        self.feedforward, self.refiner, self.config = feedforward, refiner, config
+
+    def forward(self, batch: Batch, watch: Watch | None = None) -> Refinement:
+        """The refinement of the networks' state."""
+        return refine(self.refiner, self.start(batch), steps=self.config.steps, watch=watch)
+
+    def start(self, batch: Batch) -> Batch:
+        """The batch with the networks' state as its start."""
+        state, backward = self.feedforward(*batch.frames)
+        return Batch(batch.images, batch.truth, state, backward.detach(), batch.evidence, batch.names)
