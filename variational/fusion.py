@@ -13,8 +13,10 @@ import cv2
 import numpy as np
 
 from variational.census import BITS, popcount
-from variational.jit import parallel, prange
+from variational.jit import parallel, prange, rowwise
 
+STRIP = 64
+"""Columns that a chain works on at a time: their candidates and costs of two rows stay in the nearest cache."""
 FORBIDDEN = 100.0
 """Cost of a candidate that does not exist at a pixel: finite, so that sums stay finite."""
 
@@ -80,46 +82,73 @@ def _costs(
                 costs[k, y, x] = cost
 
 
+@rowwise
+def _pass_message(
+    motion: np.ndarray, motion_from: np.ndarray, price: np.ndarray, inverse_scale: float, before: np.ndarray,
+    least: np.ndarray, message: np.ndarray,
+) -> None:  # fmt: skip
+    """message (K, X): least cost of the chains up to the row before, given each label here, less the least of all.
+
+    motion, motion_from (K, 3, X); before (K, X): costs of the chains that end in the row before.
+    """
+    count, _, width = motion.shape
+    least[:] = before[0]
+    for k in range(1, count):
+        for x in range(width):
+            least[x] = min(least[x], before[k, x])
+    for k in range(count):
+        for x in range(width):
+            message[k, x] = least[x] + price[x]
+        for m in range(count):
+            for x in range(width):
+                difference = (
+                    abs(motion[k, 0, x] - motion_from[m, 0, x])
+                    + abs(motion[k, 1, x] - motion_from[m, 1, x])
+                    + abs(motion[k, 2, x] - motion_from[m, 2, x])
+                )
+                cost = before[m, x] + price[x] * difference * inverse_scale
+                message[k, x] = cost if cost < message[k, x] else message[k, x]  # NaN: no such candidate, full price
+        for x in range(width):
+            message[k, x] -= least[x]
+
+
 @parallel
 def _chains(
     candidates: np.ndarray, costs: np.ndarray, price: np.ndarray, inverse_scale: float, out: np.ndarray
 ) -> None:
-    """out (K, H, W): for every label of every pixel, the least cost of its whole row that has this label there.
+    """out (K, H, W): for every label of every pixel, the least cost of its whole column that has this label there.
 
-    price[y, x] is paid for a full difference of motion between (x - 1, y) and (x, y).
+    price (H, W): full price between a pixel and the one above it. Exact: dynamic programming down and up, for a strip
+    of columns at a time.
     """
-    count, _, height, width = candidates.shape
-    for y in prange(height):
-        messages = np.empty((width, count), np.float32)
-        now, before = np.empty(count, np.float32), np.empty(count, np.float32)
-        for direction in range(2):
-            for j in range(width):
-                x = j if direction == 0 else width - 1 - j
-                if j == 0:
-                    now[:] = 0
+    count, height, width = costs.shape
+    for strip in prange((width + STRIP - 1) // STRIP):
+        here = slice(strip * STRIP, min((strip + 1) * STRIP, width))
+        size = min((strip + 1) * STRIP, width) - strip * STRIP
+        before, message = np.empty((count, size), costs.dtype), np.empty((count, size), costs.dtype)
+        least = np.empty(size, costs.dtype)
+        for upwards in range(2):
+            for i in range(height):
+                y = height - 1 - i if upwards else i
+                from_y = y + 1 if upwards else y - 1
+                if i == 0:
+                    message[:] = 0
                 else:
-                    from_x = x - 1 if direction == 0 else x + 1
-                    full = price[y, max(x, from_x)]
-                    least = before[0]
-                    for k in range(1, count):
-                        least = min(least, before[k])
-                    for k in range(count):
-                        best = least + full
-                        for m in range(count):
-                            difference = (
-                                abs(candidates[k, 0, y, x] - candidates[m, 0, y, from_x])
-                                + abs(candidates[k, 1, y, x] - candidates[m, 1, y, from_x])
-                                + abs(candidates[k, 2, y, x] - candidates[m, 2, y, from_x])
-                            )
-                            best = min(best, before[m] + full * difference * inverse_scale)
-                        now[k] = best - least
-                if direction == 0:
-                    messages[x] = now
-                else:
-                    for k in range(count):
-                        out[k, y, x] = costs[k, y, x] + messages[x, k] + now[k]
+                    _pass_message(
+                        candidates[:, :, y, here], candidates[:, :, from_y, here], price[max(y, from_y), here],
+                        inverse_scale, before, least, message,
+                    )  # fmt: skip
                 for k in range(count):
-                    before[k] = now[k] + costs[k, y, x]
+                    for x in range(size):
+                        at = here.start + x
+                        before[k, x] = message[k, x] + costs[k, y, at]
+                        out[k, y, at] = costs[k, y, at] + out[k, y, at] + message[k, x] if upwards else message[k, x]
+
+
+def _transposed(planes: np.ndarray) -> np.ndarray:
+    """(..., W, H) copy of (..., H, W) planes."""
+    turned = [cv2.transpose(plane) for plane in planes.reshape(-1, *planes.shape[-2:])]
+    return np.stack(turned).reshape(*planes.shape[:-2], *turned[0].shape)
 
 
 def _price(disparity: np.ndarray, grey: np.ndarray, axis: int, config: FusionConfig) -> np.ndarray:
@@ -176,11 +205,9 @@ def choose(
     np.ndarray
         (H, W) int, in 0 ... K - 1.
     """
-    motion = np.nan_to_num(candidates, nan=1e6)
     inverse_scale = np.float32(1 / config.motion_scale_px)
-    rows = np.empty_like(costs)
-    _chains(motion, costs, _price(disparity, grey, 1, config), inverse_scale, rows)
-    motion, rows = (np.ascontiguousarray(a.swapaxes(-1, -2)) for a in (motion, rows))
-    trees = np.empty_like(rows)
-    _chains(motion, rows, np.ascontiguousarray(_price(disparity, grey, 0, config).T), inverse_scale, trees)
-    return trees.argmin(axis=0).T
+    turned = _transposed(costs)
+    rows, trees = np.empty_like(turned), np.empty_like(costs)
+    _chains(_transposed(candidates), turned, cv2.transpose(_price(disparity, grey, 1, config)), inverse_scale, rows)
+    _chains(candidates, _transposed(rows), _price(disparity, grey, 0, config), inverse_scale, trees)
+    return trees.argmin(axis=0)

@@ -13,9 +13,10 @@ from variational.camera import StereoCamera
 from variational.evidence import EvidenceConfig, refill
 from variational.fusion import FusionConfig, choose, motion_costs
 from variational.initialise import Start, sample
+from variational.jit import parallel, prange
 from variational.matching import MatchingConfig
 from variational.objects import ObjectsConfig, find_objects, unexplained_surfaces
-from variational.rigid import Correspondences, RigidConfig, RigidMotion, displacement, find_motions, guess_camera
+from variational.rigid import Correspondences, RigidConfig, RigidMotion, displacements, find_motions, guess_camera
 from variational.state import D1, C, flow_of
 from variational.visibility import project_visibility
 
@@ -70,16 +71,27 @@ def _nearby(motions: list[RigidMotion], slots: int = 3) -> np.ndarray:
 
     Near is within half of the object's own size: what moves with it but could not be matched lies around it.
     """
-    distances = []
-    for motion in motions[1:]:
+    shape = motions[0].support.shape
+    labels, nearest = np.full((slots, *shape), MEASURED, np.int32), np.full((slots, *shape), np.inf, np.float32)
+    for index, motion in enumerate(motions[1:], start=1):
         distance = cv2.distanceTransform((~motion.support).astype(np.uint8), cv2.DIST_L2, 3)
-        distance[distance > 0.6 * np.sqrt(motion.support.sum()) + 15] = np.inf
-        distances.append(distance)
-    if not distances:
-        return np.empty((0, *motions[0].support.shape), np.int32)
-    stack = np.stack(distances)
-    order = np.argsort(stack, axis=0, kind="stable")[:slots]
-    return np.where(np.isfinite(np.take_along_axis(stack, order, 0)), order + 1, MEASURED).astype(np.int32)
+        _insert(distance, 0.6 * np.sqrt(motion.support.sum()) + 15, index, nearest, labels)
+    return labels[: len(motions) - 1]
+
+
+@parallel
+def _insert(distance: np.ndarray, reach: float, index: int, nearest: np.ndarray, labels: np.ndarray) -> None:
+    """Put an object into the slots of the pixels in its reach; an earlier one stays ahead at the same distance."""
+    slots, height, width = labels.shape
+    for y in prange(height):
+        for x in range(width):
+            if distance[y, x] > reach or distance[y, x] >= nearest[slots - 1, y, x]:
+                continue
+            slot = slots - 1
+            while slot > 0 and distance[y, x] < nearest[slot - 1, y, x]:
+                nearest[slot, y, x], labels[slot, y, x] = nearest[slot - 1, y, x], labels[slot - 1, y, x]
+                slot -= 1
+            nearest[slot, y, x], labels[slot, y, x] = distance[y, x], index
 
 
 def propose(
@@ -132,12 +144,8 @@ def propose(
 
 def _candidates(state: np.ndarray, start: Start, motions: list[RigidMotion], labels_of: np.ndarray) -> np.ndarray:
     """(K, 3, H, W): disparity change, u, v of the measured motion, the camera's, and of the objects near each pixel."""
-    candidates = np.full((len(labels_of), 3, *state.shape[1:]), np.nan, np.float32)
+    candidates = displacements(np.stack([motion.homography for motion in motions]), labels_of, state[D1])
     flow = flow_of(start.state)
     candidates[0, 0] = sample(start.match2.disparity, flow) - state[D1]
     candidates[0, 1:] = start.state[C + 1 :]
-    for index, motion in enumerate(motions):
-        moved = displacement(motion.homography, state[D1])
-        for k in range(1, len(labels_of)):
-            np.copyto(candidates[k], moved, where=labels_of[k] == index)
     return candidates

@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 
 from variational.camera import StereoCamera
+from variational.jit import parallel, prange, scalar
 
 logger = logging.getLogger(__name__)
 
@@ -84,27 +85,87 @@ class RigidMotion:
     support: np.ndarray
 
 
-def displacement(homography: np.ndarray, disparity: np.ndarray) -> np.ndarray:
-    """Motion that a homography of image-and-disparity space gives to each pixel.
+@parallel
+def _displacements(homographies: np.ndarray, labels: np.ndarray, disparity: np.ndarray, moved: np.ndarray) -> None:
+    height, width = disparity.shape
+    for y in prange(height):
+        for k in range(len(labels)):
+            for x in range(width):
+                moved[k, :, y, x] = np.nan
+                if labels[k, y, x] < 0:
+                    continue
+                h, d = homographies[labels[k, y, x]], disparity[y, x]
+                scale = h[3, 0] * x + h[3, 1] * y + (h[3, 2] * d + h[3, 3])
+                if scale > 0:
+                    moved[k, 0, y, x] = (h[2, 0] * x + h[2, 1] * y + (h[2, 2] * d + h[2, 3])) / scale - d
+                    moved[k, 1, y, x] = (h[0, 0] * x + h[0, 1] * y + (h[0, 2] * d + h[0, 3])) / scale - x
+                    moved[k, 2, y, x] = (h[1, 0] * x + h[1, 1] * y + (h[1, 2] * d + h[1, 3])) / scale - y
+
+
+def displacements(homographies: np.ndarray, labels: np.ndarray, disparity: np.ndarray) -> np.ndarray:
+    """Motion that homographies of image-and-disparity space give to each pixel.
 
     Parameters
     ----------
-    homography : np.ndarray
-        (4, 4), see RigidMotion.
+    homographies : np.ndarray
+        (M, 4, 4), see RigidMotion.
+    labels : np.ndarray
+        (K, H, W) integers: which homography moves the pixel, for K choices at every pixel; negative for none.
     disparity : np.ndarray
         (H, W) at time 1, pixels.
 
     Returns
     -------
     np.ndarray
-        (3, H, W) float32: disparity change, u, v in the state's order; NaN where a point goes behind the camera.
+        (K, 3, H, W) float32: disparity change, u, v in the state's order; NaN without a label and where a point goes
+        behind the camera.
     """
-    height, width = disparity.shape
-    x, y = np.arange(width, dtype=np.float32)[None], np.arange(height, dtype=np.float32)[:, None]
-    h = homography.astype(np.float32)
-    rows = [h[i, 0] * x + h[i, 1] * y + (h[i, 2] * disparity + h[i, 3]) for i in range(4)]
-    scale = np.where(rows[3] > 0, rows[3], np.nan)
-    return np.stack([rows[2] / scale - disparity, rows[0] / scale - x, rows[1] / scale - y])
+    moved = np.empty((len(labels), 3, *disparity.shape), np.float32)
+    _displacements(homographies.astype(np.float64), labels, disparity, moved)
+    return moved
+
+
+@parallel
+def _followers(
+    homography: np.ndarray, first: np.ndarray, second: np.ndarray, candidates: np.ndarray, tolerance: float,
+    follows: np.ndarray,
+) -> None:  # fmt: skip
+    """follows (H, W): the candidates whose predicted (x, y, disparity) is within the tolerance."""
+    height, width = candidates.shape
+    h = homography
+    for y in prange(height):
+        for x in range(width):
+            follows[y, x] = False
+            if candidates[y, x]:
+                a, b = first[y, x], second[y, x]
+                scale = h[3, 0] * a[0] + h[3, 1] * a[1] + h[3, 2] * a[2] + h[3, 3]
+                distance = 0.0
+                for i in range(3):
+                    distance += ((h[i, 0] * a[0] + h[i, 1] * a[1] + h[i, 2] * a[2] + h[i, 3]) / scale - b[i]) ** 2
+                follows[y, x] = distance < tolerance**2
+
+
+@scalar
+def _jump(a: np.ndarray, b: np.ndarray, a_from: np.ndarray, b_from: np.ndarray) -> float:
+    """Difference of disparity at time 1 and of motion between two correspondences a -> b."""
+    jump = abs(a[2] - a_from[2])
+    for i in range(3):
+        jump += abs((b[i] - a[i]) - (b_from[i] - a_from[i]))
+    return jump
+
+
+@parallel
+def _continuous(first: np.ndarray, second: np.ndarray, candidates: np.ndarray, most: float, out: np.ndarray) -> None:
+    """out (H, W) uint8: the candidates without a jump to the pixels on the left and above."""
+    height, width = candidates.shape
+    for y in prange(height):
+        for x in range(width):
+            smooth = candidates[y, x]
+            if smooth and x > 0:
+                smooth = _jump(first[y, x], second[y, x], first[y, x - 1], second[y, x - 1]) < most
+            if smooth and y > 0:
+                smooth = _jump(first[y, x], second[y, x], first[y - 1, x], second[y - 1, x]) < most
+            out[y, x] = smooth
 
 
 def _project(points: np.ndarray, projection: np.ndarray) -> np.ndarray:
@@ -244,9 +305,8 @@ def find_motions(matches: Correspondences, camera: StereoCamera, config: RigidCo
         if transform is None:
             return None
         homography = _homography(transform, camera)
-        support = np.zeros(region.shape, bool)
-        distance = np.linalg.norm(_apply(homography, first[left.ravel()]) - second[left.ravel()], axis=1)
-        support[left] = distance < config.tolerance_px
+        support = np.empty(region.shape, bool)
+        _followers(homography, matches.first, matches.second, left, config.tolerance_px, support)
         if np.count_nonzero(support & region) < share * np.count_nonzero(region):
             return None
         return RigidMotion(transform, homography, support)
@@ -273,11 +333,8 @@ def find_motions(matches: Correspondences, camera: StereoCamera, config: RigidCo
 
 def _pieces(matches: Correspondences, left: np.ndarray, config: RigidConfig) -> tuple[np.ndarray, np.ndarray]:
     """Connected pieces of the pixels `left`: (H, W) labels, and the labels from the largest piece to the smallest."""
-    smooth = left.copy()
-    motion = matches.second - matches.first
-    for axis in (0, 1):
-        jump = np.abs(np.diff(matches.first[..., 2], axis=axis)) + np.abs(np.diff(motion, axis=axis)).sum(axis=-1)
-        smooth[(slice(None),) * axis + (slice(1, None),)] &= jump < 2 * config.tolerance_px
-    opened = cv2.morphologyEx(smooth.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    smooth = np.empty(left.shape, np.uint8)
+    _continuous(matches.first, matches.second, left, 2 * config.tolerance_px, smooth)
+    opened = cv2.morphologyEx(smooth, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     _, labels, statistics, _ = cv2.connectedComponentsWithStats(opened, connectivity=4)
     return labels, np.argsort(-statistics[1:, cv2.CC_STAT_AREA], kind="stable")[:64] + 1

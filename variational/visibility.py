@@ -7,16 +7,16 @@ of left2 the nearest, that of largest disparity, is seen.
 
 import numpy as np
 
-from variational.jit import parallel, prange
+from variational.jit import band_edges, parallel, prange
 from variational.state import D1, C, U, V
 
 
 @parallel
-def _front(disparity: np.ndarray, u: np.ndarray, v: np.ndarray, front: np.ndarray) -> None:
+def _front(disparity: np.ndarray, u: np.ndarray, v: np.ndarray, bands: np.ndarray, front: np.ndarray) -> None:
     """front (H, W): largest disparity landing on each pixel of left2 and its direct neighbours, -1 where none lands."""
     height, width = disparity.shape
-    for band in prange(8):
-        first, last = band * height // 8, (band + 1) * height // 8
+    for band in prange(len(bands) - 1):
+        first, last = bands[band], bands[band + 1]
         for y in range(height):
             for x in range(width):
                 to_x, to_y = int(np.floor(x + u[y, x])), int(np.floor(y + v[y, x]))
@@ -40,7 +40,7 @@ def _seen(
 
 def _front_of(state: np.ndarray) -> np.ndarray:
     front = np.full(state.shape[1:], -1, np.float32)
-    _front(np.maximum(state[D1] + state[C], 0), state[U], state[V], front)
+    _front(np.maximum(state[D1] + state[C], 0), state[U], state[V], band_edges(state.shape[1]), front)
     return front
 
 
@@ -68,11 +68,11 @@ def project_visibility(state: np.ndarray, margin_px: float = 1.5) -> np.ndarray:
 @parallel
 def _backward(
     disparity: np.ndarray, u: np.ndarray, v: np.ndarray, front: np.ndarray, margin: float, best: np.ndarray,
-    backward: np.ndarray,
+    bands: np.ndarray, backward: np.ndarray,
 ) -> None:  # fmt: skip
     height, width = disparity.shape
-    for band in prange(8):
-        first, last = band * height // 8, (band + 1) * height // 8
+    for band in prange(len(bands) - 1):
+        first, last = bands[band], bands[band + 1]
         for y in range(height):
             for x in range(width):
                 at_x, at_y = x + u[y, x], y + v[y, x]
@@ -103,5 +103,6 @@ def backward_flow(state: np.ndarray, fallback: np.ndarray, margin_px: float = 1.
     backward = fallback.astype(np.float32, copy=True)
     best = np.full(state.shape[1:], np.inf, np.float32)
     disparity = np.maximum(state[D1] + state[C], 0)
-    _backward(disparity, state[U], state[V], _front_of(state), np.float32(margin_px), best, backward)
+    bands = band_edges(state.shape[1])
+    _backward(disparity, state[U], state[V], _front_of(state), np.float32(margin_px), best, bands, backward)
     return backward

@@ -1,0 +1,121 @@
+"""Census, aggregation, selection: against plain twins; signs, borders, threads, inputs."""
+
+import cv2
+import numba
+import numpy as np
+import pytest
+
+from tests import naive_matching
+from variational.census import OUTSIDE_COST, census, stereo_costs
+from variational.matching import MatchingConfig, _aggregate, _large_steps, aggregate, fill_background, match
+
+SHAPE = (11, 17)
+
+
+def texture(shape: tuple[int, int], seed: int = 0) -> np.ndarray:
+    noise = np.random.default_rng(seed).random(shape, dtype=np.float32)
+    image = cv2.GaussianBlur(noise, (0, 0), 0.8)
+    return (image - image.min()) / (image.max() - image.min())
+
+
+def pair(disparity: int, shape: tuple[int, int] = (48, 90)) -> tuple[np.ndarray, np.ndarray]:
+    """left(x) = right(x - disparity): a wall."""
+    wide = texture((shape[0], shape[1] + disparity))
+    return np.ascontiguousarray(wide[:, : shape[1]]), np.ascontiguousarray(wide[:, disparity:])
+
+
+def test_costs_are_differing_census_bits() -> None:
+    left, right = texture(SHAPE, 1), texture(SHAPE, 2)
+    costs = stereo_costs(census(left), census(right), 6)
+    smooth = [cv2.GaussianBlur(image, (0, 0), 1.0) for image in (left, right)]
+    for y, x, d in [(0, 0, 0), (0, 3, 2), (5, 9, 4), (10, 16, 5), (7, 5, 5)]:
+        expected = naive_matching.census_distance(left, right, x, x - d, y, 1)
+        expected += naive_matching.census_distance(*smooth, x, x - d, y, 2)
+        assert costs[y, x, d] == expected
+    assert (costs[:, 2, 3:] == OUTSIDE_COST).all()
+
+
+@pytest.mark.parametrize("shape", [(6, 9, 4), (7, 5, 19), (1, 8, 3)])
+def test_aggregation_equals_the_plain_recursion(shape: tuple[int, int, int]) -> None:
+    rng = np.random.default_rng(3)
+    costs = rng.integers(0, 125, shape).astype(np.uint8)
+    grey = rng.random(shape[:2], dtype=np.float32)
+    config = MatchingConfig(uniqueness=30)
+    large_x, large_y = _large_steps(grey, config)
+
+    def large(y: int, x: int, from_y: int, from_x: int) -> int:
+        return int(large_x[y, max(x, from_x)] if y == from_y else large_y[max(y, from_y), x])
+
+    total = naive_matching.aggregate(costs, large, config.small_step)
+    expected, expected_matched = naive_matching.select(total, 1.0, config.uniqueness)
+    disparity, matched = np.empty(shape[:2], np.float32), np.empty(shape[:2], bool)
+    small, limits = np.int16(config.small_step), (np.float32(1), np.float32(config.uniqueness))
+    _aggregate(costs, large_x, large_y, small, *limits, np.zeros(shape, np.int16), disparity, matched)
+    np.testing.assert_allclose(disparity, expected, atol=1e-6)
+    np.testing.assert_array_equal(matched, expected_matched)
+
+
+def test_a_recursion_without_diagonals_would_not_pass(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(naive_matching, "PATHS", naive_matching.PATHS[:4])
+    with pytest.raises(AssertionError):
+        test_aggregation_equals_the_plain_recursion((6, 9, 4))
+
+
+def test_disparity_is_positive_where_the_right_image_is_shifted_left() -> None:
+    left, right = pair(7)
+    right_first = match(left, right, MatchingConfig(max_disparity=15))
+    inside = right_first.disparity[:, 7:]
+    assert np.abs(inside - 7).max() < 0.5
+    assert right_first.matched[4:-4, 11:-4].mean() > 0.98
+    # Exchanged images have no positive disparity to find: only the mirrored pair has.
+    mirrored = match(right[:, ::-1].copy(), left[:, ::-1].copy(), MatchingConfig(max_disparity=15))
+    assert np.abs(mirrored.disparity[:, 7:] - 7).max() < 0.5
+    assert match(right, left, MatchingConfig(max_disparity=15)).matched.mean() < 0.3
+
+
+def test_the_range_is_found() -> None:
+    left, right = pair(21, (96, 260))
+    result = match(left, right, MatchingConfig())
+    assert 21 < result.max_disparity < 64
+    assert np.abs(result.disparity[:, 21:] - 21).max() < 0.5
+
+
+def test_the_same_bits_for_one_and_two_threads_and_inputs_unchanged() -> None:
+    left, right = pair(5)
+    kept = left.copy(), right.copy()
+    before = numba.get_num_threads()
+    results = []
+    try:
+        for threads in (1, min(2, before)):
+            numba.set_num_threads(threads)
+            results.append(match(left, right, MatchingConfig(max_disparity=12)))
+    finally:
+        numba.set_num_threads(before)
+    np.testing.assert_array_equal(results[0].disparity, results[1].disparity)
+    np.testing.assert_array_equal(results[0].matched, results[1].matched)
+    np.testing.assert_array_equal(kept[0], left)
+    np.testing.assert_array_equal(kept[1], right)
+
+
+def test_constant_images_stay_finite() -> None:
+    flat = np.full((32, 40), 0.5, np.float32)
+    result = match(flat, flat, MatchingConfig())
+    np.testing.assert_array_equal(result.disparity, 0)
+
+
+def test_specks_are_unmatched() -> None:
+    costs = np.full((40, 60, 8), 90, np.uint8)
+    costs[:, :, 2] = 0
+    costs[10:13, 20:23] = 90
+    costs[10:13, 20:23, 7] = 0
+    config = MatchingConfig(small_step=1, large_step=1)
+    _, matched = aggregate(costs, np.zeros((40, 60), np.float32), config)
+    assert matched[20:, 10:].all()
+    assert not matched[10:13, 20:23].any()
+
+
+def test_background_fills_from_the_smaller_neighbour_and_empty_rows_from_the_next() -> None:
+    disparity = np.array([[0, 5, 0, 0, 9, 0], [0, 0, 0, 0, 0, 0], [0, 0, 3, 0, 0, 0]], np.float32)
+    filled = fill_background(disparity, disparity > 0)
+    np.testing.assert_array_equal(filled, [[5, 5, 5, 5, 9, 9], [5, 5, 5, 5, 9, 9], [3, 3, 3, 3, 3, 3]])
+    assert not fill_background(disparity, np.zeros(disparity.shape, bool)).any()
