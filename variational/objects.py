@@ -20,6 +20,8 @@ class ObjectsConfig:
 
     Parameters
     ----------
+    features : int
+        Most features in an image, the strongest; 0 leaves the search out.
     cost : float
         A pixel is unexplained if its chosen motion costs more than this (variational.fusion), in [0, 1].
     least_px : int
@@ -32,6 +34,7 @@ class ObjectsConfig:
         Fewest matched features that a motion is fitted to, and must explain.
     """
 
+    features: int = 2500
     cost: float = 0.45
     least_px: int = 150
     jump_px: float = 1.5
@@ -77,9 +80,9 @@ def find_objects(
     list of RigidMotion
         One for each surface whose features agree on a motion.
     """
-    if not surfaces:
+    if not surfaces or config.features == 0:
         return []
-    detector = cv2.SIFT.create(contrastThreshold=0.01)
+    detector = cv2.SIFT.create(nfeatures=config.features, contrastThreshold=0.01)
     around = cv2.dilate(np.any(surfaces, axis=0).astype(np.uint8), np.ones((9, 9), np.uint8))
     points1, words1 = detector.detectAndCompute(to_bytes(left1), around)
     points2, words2 = detector.detectAndCompute(to_bytes(left2), None)

@@ -49,7 +49,8 @@ def test_the_systems_hold_the_energy_and_its_gradient():
     state = scene.state + rng.uniform(0.1, 0.4, scene.state.shape).astype(np.float32)
     everywhere = np.ones(scene.frames.shape, bool)
     systems = Constancy(scene.frames, config).systems(state, (everywhere,) * 3)
-    planes = [features(np.ascontiguousarray(getattr(scene.frames, n)[..., 0]), config) for n in ("left1", "right1", "left2", "right2")]
+    images = (scene.frames.left1, scene.frames.right1, scene.frames.left2, scene.frames.right2)
+    planes = [features(np.ascontiguousarray(image[..., 0]), config) for image in images]
     for y, x in ((20, 30), (40, 50), (11, 77), (50, 61)):
         z = state[ORDER, y, x].astype(np.float64)
         energy, thetas = _naive_energy(planes, y, x, z, state[1], config)
