@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 
 from variational.census import popcount, write_matching_costs
-from variational.jit import parallel, prange, scalar
+from variational.jit import parallel, prange, rowwise, scalar
 from variational.matching import MatchingConfig, StereoMatch, aggregate
 
 
@@ -53,7 +53,10 @@ class EvidenceConfig:
 
 @parallel
 def _front(disparity: np.ndarray, matched: np.ndarray, front: np.ndarray) -> None:
-    """front (H, W): largest matched disparity that lands on each pixel of the right image, -1 where none does."""
+    """front (H, W + D): largest matched disparity that lands on each pixel of the right image, -1 where none does.
+
+    From the image's right end, as the matching costs go through it; the last D columns lie outside.
+    """
     height, width = disparity.shape
     for y in prange(height):
         front[y] = -1
@@ -61,26 +64,55 @@ def _front(disparity: np.ndarray, matched: np.ndarray, front: np.ndarray) -> Non
             if matched[y, x]:
                 at = x - disparity[y, x]
                 for to_x in (int(np.floor(at)), int(np.ceil(at))):
-                    if to_x >= 0 and disparity[y, x] > front[y, to_x]:
-                        front[y, to_x] = disparity[y, x]
+                    if to_x >= 0 and disparity[y, x] > front[y, width - 1 - to_x]:
+                        front[y, width - 1 - to_x] = disparity[y, x]
 
 
 @scalar
-def _time_cost(
-    words_left1: np.ndarray, words_left2: np.ndarray, words_right2: np.ndarray, x: int, y: int, to_x: float,
-    to_y: float, to_disparity: float, unknown: np.float32,
-) -> np.float32:  # fmt: skip
-    """Differing bits at time 2, the mean of both cameras where both see the place."""
-    _, height, width = words_left1.shape
-    if not (0 <= to_x <= width - 1 and 0 <= to_y <= height - 1):
-        return unknown
-    i, j = int(to_x + 0.5), int(to_y + 0.5)
-    fine, wide = words_left1[0, y, x], words_left1[1, y, x]
-    bits = np.float32(popcount(fine ^ words_left2[0, j, i]) + popcount(wide ^ words_left2[1, j, i]))
-    i = int(np.rint(to_x - to_disparity))
-    if not 0 <= i < width:
-        return bits
-    return np.float32(0.5) * (bits + popcount(fine ^ words_right2[0, j, i]) + popcount(wide ^ words_right2[1, j, i]))
+def _inside(position: np.float32, size: np.int32) -> np.int32:
+    """The pixel nearest to a position, in the image whatever the position is."""
+    nearest = np.floor(position + np.float32(0.5))
+    last = np.float32(size - 1)
+    nearest = nearest if nearest > 0 else np.float32(0)
+    return np.int32(nearest if nearest < last else last)
+
+
+@rowwise
+def _add_evidence(
+    row: np.ndarray, front: np.ndarray, known: np.float32, fine: np.uint64, wide: np.uint64, fine_left: np.ndarray,
+    wide_left: np.ndarray, fine_right: np.ndarray, wide_right: np.ndarray, width: np.int32, height: np.int32,
+    start: tuple, step: tuple, hidden: np.float32, contradicted: np.float32, time_weight: np.float32,
+    unknown: np.float32, pull: np.float32, pull_most: np.float32,
+) -> None:  # fmt: skip
+    """Turn one pixel's matching costs (D,) into costs of all evidence.
+
+    fine_*, wide_* (H * W,): words at time 2. start, step: the place (x, y, disparity, 1) at time 2 is, but for its
+    scale, start + d * step. No branches and all in float32, so that disparities are worked on in vectors.
+    """
+    one, half, zero = np.float32(1), np.float32(0.5), np.float32(0)
+    margin, most = np.float32(1.5), np.float32(255)
+    right_end, bottom, beyond = np.float32(width - 1), np.float32(height - 1), np.float32(width) - half
+    for d in range(row.size):
+        fd = np.float32(np.int32(d))
+        stereo, seen = np.float32(row[d]), front[d]
+        nearer = stereo if stereo > contradicted else contradicted
+        compared = hidden if fd < seen - margin else (nearer if fd > seen + margin else stereo)
+        stereo = compared if seen >= zero else stereo
+        scale = start[3] + step[3] * fd
+        ahead = scale > zero
+        inverse = one / (scale if ahead else one)
+        to_x, to_y = (start[0] + step[0] * fd) * inverse, (start[1] + step[1] * fd) * inverse
+        in_right = to_x - (start[2] + step[2] * fd) * inverse
+        begin = _inside(to_y, height) * width
+        at, at_right = begin + _inside(to_x, width), begin + _inside(in_right, width)
+        bits = np.float32(np.int32(popcount(fine ^ fine_left[at]) + popcount(wide ^ wide_left[at])))
+        bits_right = np.float32(np.int32(popcount(fine ^ fine_right[at_right]) + popcount(wide ^ wide_right[at_right])))
+        both = (in_right >= -half) & (in_right < beyond)
+        bits = half * (bits + bits_right) if both else bits
+        inside = (to_x >= zero) & (to_x <= right_end) & (to_y >= zero) & (to_y <= bottom) & ahead
+        away = abs(fd - known) * pull
+        cost = stereo + time_weight * (bits if inside else unknown) + (away if away < pull_most else pull_most)
+        row[d] = np.uint8(np.int32(cost if cost < most else most))
 
 
 @parallel
@@ -90,35 +122,31 @@ def _write_costs(
     hidden: np.float32, contradicted: np.float32, time_weight: float, unknown: np.float32, pull: float,
     pull_most: float, costs: np.ndarray,
 ) -> None:  # fmt: skip
+    """words_left2, words_right2: (2, H * W)."""
     height, width, disparities = costs.shape
+    most, reach = np.float32(255), int(min(255 / anchor, disparities)) + 2
     for y in prange(height):
+        fy = np.float32(y)
         for x in range(width):
             row, known = costs[y, x], disparity[y, x]
             if matched[y, x]:
-                for d in range(disparities):
-                    row[d] = np.uint8(min(abs(np.float32(d) - known) * anchor, np.float32(255)))
+                row[:] = np.uint8(255)
+                for d in range(max(int(known) - reach, 0), min(int(known) + reach + 1, disparities)):
+                    row[d] = np.uint8(min(abs(np.float32(d) - known) * anchor, most))
                 continue
             write_matching_costs(words_left1[:, y], right1_mirrored[:, y], x, row)
-            label = labels[y, x]
-            h = homographies[max(label, 0)]
-            base0, base1, base2, base3 = (
-                h[0, 0] * x + h[0, 1] * y + h[0, 3], h[1, 0] * x + h[1, 1] * y + h[1, 3],
-                h[2, 0] * x + h[2, 1] * y + h[2, 3], h[3, 0] * x + h[3, 1] * y + h[3, 3],
+            h, fx = homographies[max(labels[y, x], 0)], np.float32(x)
+            start = (
+                h[0, 0] * fx + h[0, 1] * fy + h[0, 3], h[1, 0] * fx + h[1, 1] * fy + h[1, 3],
+                h[2, 0] * fx + h[2, 1] * fy + h[2, 3], h[3, 0] * fx + h[3, 1] * fy + h[3, 3],
             )  # fmt: skip
-            for d in range(disparities):
-                seen = front[y, x - d] if x >= d else np.float32(-1)
-                stereo = np.float32(row[d])
-                if seen >= 0:
-                    stereo = hidden if d < seen - 1.5 else max(contradicted, stereo) if d > seen + 1.5 else stereo
-                time = unknown
-                scale = base3 + h[3, 2] * d
-                if label >= 0 and scale > 0:
-                    time = _time_cost(
-                        words_left1, words_left2, words_right2, x, y, (base0 + h[0, 2] * d) / scale,
-                        (base1 + h[1, 2] * d) / scale, (base2 + h[2, 2] * d) / scale, unknown,
-                    )  # fmt: skip
-                background = min(abs(d - known) * pull, pull_most)
-                row[d] = np.uint8(min(stereo + time_weight * time + background, 255.0))
+            if labels[y, x] < 0:  # no motion: behind the camera, where nothing is compared
+                start = (np.float32(0), np.float32(0), np.float32(0), np.float32(-np.inf))
+            _add_evidence(
+                row, front[y, width - 1 - x :], known, words_left1[0, y, x], words_left1[1, y, x], words_left2[0],
+                words_left2[1], words_right2[0], words_right2[1], np.int32(width), np.int32(height), start,
+                (h[0, 2], h[1, 2], h[2, 2], h[3, 2]), hidden, contradicted, time_weight, unknown, pull, pull_most,
+            )  # fmt: skip
 
 
 def refill(
@@ -145,11 +173,11 @@ def refill(
     """
     f = np.float32
     costs = np.empty((*grey.shape, match1.max_disparity + 1), np.uint8)
-    front = np.empty(grey.shape, f)
+    front = np.empty((grey.shape[0], grey.shape[1] + costs.shape[2]), f)
     _front(match1.disparity, match1.matched, front)
     _write_costs(
         match1.disparity, match1.matched, front, match1.words_left, np.ascontiguousarray(match1.words_right[..., ::-1]),
-        match2.words_left, match2.words_right, labels.astype(np.int32), homographies.astype(f),
+        match2.words_left.reshape(2, -1), match2.words_right.reshape(2, -1), labels.astype(np.int32), homographies.astype(f),
         f(config.anchor_per_px), f(config.hidden_cost), f(config.contradicted_cost), f(config.time_weight),
         f(config.unknown_cost), f(config.background_per_px), f(config.background_most), costs,
     )  # fmt: skip

@@ -15,8 +15,9 @@ import numpy as np
 from variational.census import BITS, popcount
 from variational.jit import parallel, prange, rowwise
 
-STRIP = 64
-"""Columns that a chain works on at a time: their candidates and costs of two rows stay in the nearest cache."""
+STRIP = 192
+"""Columns that a chain works on at a time: their candidates and costs of two rows stay in the nearest cache, and what
+a slice costs to make is shared by enough of them."""
 FORBIDDEN = 100.0
 """Cost of a candidate that does not exist at a pixel: finite, so that sums stay finite."""
 
@@ -83,8 +84,20 @@ def _costs(
 
 
 @rowwise
+def _least_of_two(
+    change: np.ndarray, u: np.ndarray, v: np.ndarray, change_from: np.ndarray, u_from: np.ndarray, v_from: np.ndarray,
+    price: np.ndarray, before: np.ndarray, message: np.ndarray,
+) -> None:  # fmt: skip
+    """message (X,) <- its minimum with the costs before plus those of the step; flat arguments, to be vectorised."""
+    for x in range(message.size):
+        difference = abs(change[x] - change_from[x]) + abs(u[x] - u_from[x]) + abs(v[x] - v_from[x])
+        cost = before[x] + price[x] * difference
+        message[x] = cost if cost < message[x] else message[x]  # NaN: no such candidate, full price
+
+
+@rowwise
 def _pass_message(
-    motion: np.ndarray, motion_from: np.ndarray, price: np.ndarray, inverse_scale: float, before: np.ndarray,
+    motion: np.ndarray, motion_from: np.ndarray, price: np.ndarray, price_per_px: np.ndarray, before: np.ndarray,
     least: np.ndarray, message: np.ndarray,
 ) -> None:  # fmt: skip
     """message (K, X): least cost of the chains up to the row before, given each label here, less the least of all.
@@ -97,19 +110,36 @@ def _pass_message(
         for x in range(width):
             least[x] = min(least[x], before[k, x])
     for k in range(count):
+        now = motion[k]
         for x in range(width):
             message[k, x] = least[x] + price[x]
         for m in range(count):
-            for x in range(width):
-                difference = (
-                    abs(motion[k, 0, x] - motion_from[m, 0, x])
-                    + abs(motion[k, 1, x] - motion_from[m, 1, x])
-                    + abs(motion[k, 2, x] - motion_from[m, 2, x])
-                )
-                cost = before[m, x] + price[x] * difference * inverse_scale
-                message[k, x] = cost if cost < message[k, x] else message[k, x]  # NaN: no such candidate, full price
+            last = motion_from[m]
+            _least_of_two(now[0], now[1], now[2], last[0], last[1], last[2], price_per_px, before[m], message[k])
         for x in range(width):
             message[k, x] -= least[x]
+
+
+@rowwise
+def _add_costs(costs: np.ndarray, message: np.ndarray, upwards: int, before: np.ndarray, out: np.ndarray) -> None:
+    """One label of one row of a strip: the chain's cost up to here, and what this direction adds to the result."""
+    for x in range(message.size):
+        before[x] = message[x] + costs[x]
+    if upwards:
+        for x in range(message.size):
+            out[x] += before[x]
+    else:
+        out[:] = message
+
+
+@rowwise
+def _take_strip(candidates: np.ndarray, y: int, begin: int, motion: np.ndarray) -> None:
+    """motion (K, 3, X): row y of the candidates from column `begin` on."""
+    count, channels, width = motion.shape
+    for k in range(count):
+        for i in range(channels):
+            for x in range(width):
+                motion[k, i, x] = candidates[k, i, y, begin + x]
 
 
 @parallel
@@ -123,26 +153,26 @@ def _chains(
     """
     count, height, width = costs.shape
     for strip in prange((width + STRIP - 1) // STRIP):
-        here = slice(strip * STRIP, min((strip + 1) * STRIP, width))
-        size = min((strip + 1) * STRIP, width) - strip * STRIP
+        begin = strip * STRIP
+        size = min(STRIP, width - begin)
         before, message = np.empty((count, size), costs.dtype), np.empty((count, size), costs.dtype)
-        least = np.empty(size, costs.dtype)
+        # Copies of the strip's part of two rows: a view of the planes has strides that the compiler cannot know.
+        motions, step = np.empty((2, count, 3, size), costs.dtype), np.empty(size, costs.dtype)
+        step_per_px, least = np.empty(size, costs.dtype), np.empty(size, costs.dtype)
         for upwards in range(2):
             for i in range(height):
                 y = height - 1 - i if upwards else i
-                from_y = y + 1 if upwards else y - 1
+                now = i % 2
+                _take_strip(candidates, y, begin, motions[now])
                 if i == 0:
                     message[:] = 0
                 else:
-                    _pass_message(
-                        candidates[:, :, y, here], candidates[:, :, from_y, here], price[max(y, from_y), here],
-                        inverse_scale, before, least, message,
-                    )  # fmt: skip
+                    step[:] = price[y + upwards, begin : begin + size]
+                    step_per_px[:] = step * inverse_scale
+                    _pass_message(motions[now], motions[1 - now], step, step_per_px, before, least, message)
                 for k in range(count):
-                    for x in range(size):
-                        at = here.start + x
-                        before[k, x] = message[k, x] + costs[k, y, at]
-                        out[k, y, at] = costs[k, y, at] + out[k, y, at] + message[k, x] if upwards else message[k, x]
+                    here = costs[k, y, begin : begin + size]
+                    _add_costs(here, message[k], upwards, before[k], out[k, y, begin : begin + size])
 
 
 def _transposed(planes: np.ndarray) -> np.ndarray:
