@@ -27,6 +27,8 @@ class EvidenceConfig:
 
     Parameters
     ----------
+    fill : bool
+        False keeps what the matching filled in, and the motions that were chosen first: faster, less accurate.
     anchor_per_px : float
         What a matched pixel pays for each pixel of deviation.
     hidden_cost, contradicted_cost : float
@@ -41,6 +43,7 @@ class EvidenceConfig:
         Penalty for a change of disparity by one pixel; larger than for matching, since here there is less to go by.
     """
 
+    fill: bool = True
     anchor_per_px: float = 30.0
     hidden_cost: float = 60.0
     contradicted_cost: float = 90.0

@@ -1,8 +1,8 @@
 """Minimisers. They know arrays and systems, nothing of images.
 
 `relax` minimises a sum of quadratic forms, one a pixel, and of weighted squared differences of neighbours, by red-black
-successive over-relaxation with a 4 x 4 solve at each pixel. `descend` minimises anything that gives a value and a
-gradient.
+successive over-relaxation with a 4 x 4 solve at each pixel, whose matrix is factorised once. `descend` minimises
+anything that gives a value and a gradient.
 """
 
 from collections.abc import Callable
@@ -10,30 +10,46 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from variational.jit import parallel, prange, scalar, total
+from variational.jit import band_edges, parallel, prange, rowwise, scalar
 
 GROUPS = 4
 """Channels that are smoothed together: D1; C; u and v; D2."""
+CHANNELS = (0, 2, 3, 4, 1)
+"""The state's channels in the order of a pixel's system and of the fields in here: D1, C, u, v, D2."""
+PREPARED = 16
+"""Numbers a pixel that sweeps read, one cache line: 10 of a Cholesky factor, 1 / A of D2, 5 right sides."""
 
 
 @scalar
-def _solve4(a: np.ndarray, b: np.ndarray) -> None:
-    """b <- A^-1 b by Cholesky's decomposition; a holds the upper triangle by rows and is overwritten."""
-    l0 = np.sqrt(a[0])
-    l1, l2, l3 = a[1] / l0, a[2] / l0, a[3] / l0
-    m1 = np.sqrt(a[4] - l1 * l1)
-    m2, m3 = (a[5] - l1 * l2) / m1, (a[6] - l1 * l3) / m1
-    n2 = np.sqrt(a[7] - l2 * l2 - m2 * m2)
-    n3 = (a[8] - l2 * l3 - m2 * m3) / n2
-    o3 = np.sqrt(a[9] - l3 * l3 - m3 * m3 - n3 * n3)
-    y0 = b[0] / l0
-    y1 = (b[1] - l1 * y0) / m1
-    y2 = (b[2] - l2 * y0 - m2 * y1) / n2
-    y3 = (b[3] - l3 * y0 - m3 * y1 - n3 * y2) / o3
-    b[3] = y3 / o3
-    b[2] = (y2 - n3 * b[3]) / n2
-    b[1] = (y1 - m2 * b[2] - m3 * b[3]) / m1
-    b[0] = (y0 - l1 * b[1] - l2 * b[2] - l3 * b[3]) / l0
+def _factorise(a: np.ndarray) -> None:
+    """Upper triangle (by rows) of a 4 x 4 matrix -> its Cholesky factor, reciprocals on the diagonal."""
+    one = np.float32(1)
+    a[0] = one / np.sqrt(a[0])
+    a[1], a[2], a[3] = a[1] * a[0], a[2] * a[0], a[3] * a[0]
+    a[4] = one / np.sqrt(a[4] - a[1] * a[1])
+    a[5], a[6] = (a[5] - a[1] * a[2]) * a[4], (a[6] - a[1] * a[3]) * a[4]
+    a[7] = one / np.sqrt(a[7] - a[2] * a[2] - a[5] * a[5])
+    a[8] = (a[8] - a[2] * a[3] - a[5] * a[6]) * a[7]
+    a[9] = one / np.sqrt(a[9] - a[3] * a[3] - a[6] * a[6] - a[8] * a[8])
+
+
+@parallel
+def _subtract(state: np.ndarray, reference: np.ndarray, field: np.ndarray) -> None:
+    """field (H + 2, W + 2, 5), zero at its rim: what a state differs by from its reference, pixel by pixel."""
+    _, height, width = state.shape
+    for y in prange(height):
+        for x in range(width):
+            for i, channel in enumerate(CHANNELS):
+                field[y + 1, x + 1, i] = state[channel, y, x] - reference[channel, y, x]
+
+
+@parallel
+def _add(reference: np.ndarray, field: np.ndarray, state: np.ndarray) -> None:
+    _, height, width = state.shape
+    for y in prange(height):
+        for i, channel in enumerate(CHANNELS):
+            for x in range(width):
+                state[channel, y, x] = reference[channel, y, x] + field[y + 1, x + 1, i]
 
 
 @parallel
@@ -41,23 +57,21 @@ def _smoothness_weights(
     field: np.ndarray, edges: np.ndarray, edges2: np.ndarray, lambdas: np.ndarray, eps2: float,
     weights: np.ndarray, energy: np.ndarray,
 ) -> None:  # fmt: skip
-    """weights (H, W, 2 * GROUPS): between each pixel and the one to the left, then the one above; 0 at the border."""
-    _, height, width = field.shape
+    """weights (H + 1, W + 1, 2 * GROUPS), zero at first: of each pixel with the one to the left, then the one above."""
+    _, height, width = edges.shape
     for y in prange(height):
         row = 0.0
         for x in range(width):
+            here = field[y + 1, x + 1]
             for axis in range(2):
                 if (axis == 0 and x == 0) or (axis == 1 and y == 0):
-                    for g in range(GROUPS):
-                        weights[y, x, 2 * g + axis] = 0
                     continue
-                yy, xx = np.int64(y) - axis, x - 1 + axis
+                other = field[np.int64(y) + 1 - axis, x + axis]
                 for g in range(GROUPS):
+                    channel = g if g < 3 else 4
+                    square = (here[channel] - other[channel]) ** 2
                     if g == 2:
-                        square = (field[3, y, x] - field[3, yy, xx]) ** 2 + (field[4, y, x] - field[4, yy, xx]) ** 2
-                    else:
-                        channel = 0 if g == 0 else (2 if g == 1 else 1)
-                        square = (field[channel, y, x] - field[channel, yy, xx]) ** 2
+                        square += (here[3] - other[3]) ** 2
                     root = np.sqrt(square + eps2)
                     strength = lambdas[g] * (edges2[axis, y, x] if g == 3 else edges[axis, y, x])
                     weights[y, x, 2 * g + axis] = strength / root
@@ -66,60 +80,87 @@ def _smoothness_weights(
 
 
 @parallel
-def _sweep(
-    field: np.ndarray, systems: np.ndarray, right_side: np.ndarray, weights: np.ndarray, pull: np.ndarray,
-    colour: int, omega: float,
-) -> None:  # fmt: skip
-    """One half sweep over the pixels of one colour; right_side (H, W, 5) is in the order D1, C, u, v, D2."""
-    _, height, width = field.shape
+def _prepare(
+    field: np.ndarray, systems: np.ndarray, weights: np.ndarray, pull: np.ndarray, prepared: np.ndarray, energy: np.ndarray
+) -> None:
+    """prepared (H, W, PREPARED); adds the energies of data and pull at `field` to those of each row.
+
+    The right side is A z - b for the unknowns z of the field: what A z_new must be where nothing is smooth. The pull
+    towards a correction of zero adds nothing to it.
+    """
+    height, width, _ = systems.shape
     for y in prange(height):
-        a, b = np.empty(10, np.float32), np.empty(5, np.float32)
-        diagonal = np.empty(GROUPS, np.float32)
-        for x in range((y + colour) % 2, width, 2):
-            b[:] = right_side[y, x]
-            diagonal[:] = pull[y, x]  # towards a correction of zero: nothing on the right side
-            for side in range(4):
-                axis, step = side // 2, 2 * (side % 2) - 1  # left, right, above, below
-                yy, xx = np.int64(y) + step * axis, x + step * (1 - axis)
-                if yy < 0 or yy >= height or xx < 0 or xx >= width:
-                    continue
-                w = weights[max(yy, np.int64(y)), max(xx, x)]
-                b[0] += w[axis] * field[0, yy, xx]
-                b[1] += w[2 + axis] * field[2, yy, xx]
-                b[2] += w[4 + axis] * field[3, yy, xx]
-                b[3] += w[4 + axis] * field[4, yy, xx]
-                b[4] += w[6 + axis] * field[1, yy, xx]
-                for g in range(GROUPS):
-                    diagonal[g] += w[2 * g + axis]
-            s = systems[y, x]
+        row = 0.0
+        for x in range(width):
+            s, a, z, p = systems[y, x], prepared[y, x], field[y + 1, x + 1], pull[y, x]
+            own, right, below = weights[y, x], weights[y, x + 1], weights[y + 1, x]
             for k in range(10):
                 a[k] = s[k]
-            a[0] += diagonal[0]
-            a[4] += diagonal[1]
-            a[7] += diagonal[2]
-            a[9] += diagonal[2]
-            second = b[4] / (s[14] + diagonal[3])
-            _solve4(a, b)
-            field[0, y, x] += omega * (b[0] - field[0, y, x])
-            field[2, y, x] += omega * (b[1] - field[2, y, x])
-            field[3, y, x] += omega * (b[2] - field[3, y, x])
-            field[4, y, x] += omega * (b[3] - field[4, y, x])
-            field[1, y, x] += omega * (second - field[1, y, x])
+            a[0] += own[0] + own[1] + right[0] + below[1] + p[0]
+            a[4] += own[2] + own[3] + right[2] + below[3] + p[1]
+            flow = own[4] + own[5] + right[4] + below[5] + p[2]
+            a[7] += flow
+            a[9] += flow
+            a[10] = np.float32(1) / (s[14] + own[6] + own[7] + right[6] + below[7] + p[3])
+            _factorise(a)
+            a[11] = s[0] * z[0] + s[1] * z[1] + s[2] * z[2] + s[3] * z[3] - s[10]
+            a[12] = s[1] * z[0] + s[4] * z[1] + s[5] * z[2] + s[6] * z[3] - s[11]
+            a[13] = s[2] * z[0] + s[5] * z[1] + s[7] * z[2] + s[8] * z[3] - s[12]
+            a[14] = s[3] * z[0] + s[6] * z[1] + s[8] * z[2] + s[9] * z[3] - s[13]
+            a[15] = s[14] * z[4] - s[15]
+            squares = p[0] * z[0] ** 2 + p[1] * z[1] ** 2 + p[2] * (z[2] ** 2 + z[3] ** 2) + p[3] * z[4] ** 2
+            row += s[16] + s[17] + np.float32(0.5) * squares
+        energy[y] += row
+
+
+@rowwise
+def _sweep_row(
+    field: np.ndarray, prepared: np.ndarray, weights: np.ndarray, y: int, colour: int, omega: np.float32
+) -> None:
+    """Relax the pixels of one colour in one row."""
+    width = prepared.shape[1]
+    for x in range((y + colour) % 2, width, 2):
+        a, z = prepared[y, x], field[y + 1, x + 1]
+        own, w_right, w_below = weights[y, x], weights[y, x + 1], weights[y + 1, x]
+        left, right, above, below = field[y + 1, x], field[y + 1, x + 2], field[y, x + 1], field[y + 2, x + 1]
+        b0 = a[11] + own[0] * left[0] + w_right[0] * right[0] + own[1] * above[0] + w_below[1] * below[0]
+        b1 = a[12] + own[2] * left[1] + w_right[2] * right[1] + own[3] * above[1] + w_below[3] * below[1]
+        b2 = a[13] + own[4] * left[2] + w_right[4] * right[2] + own[5] * above[2] + w_below[5] * below[2]
+        b3 = a[14] + own[4] * left[3] + w_right[4] * right[3] + own[5] * above[3] + w_below[5] * below[3]
+        b4 = a[15] + own[6] * left[4] + w_right[6] * right[4] + own[7] * above[4] + w_below[7] * below[4]
+        b0 = b0 * a[0]
+        b1 = (b1 - a[1] * b0) * a[4]
+        b2 = (b2 - a[2] * b0 - a[5] * b1) * a[7]
+        b3 = (b3 - a[3] * b0 - a[6] * b1 - a[8] * b2) * a[9] * a[9]
+        b2 = (b2 - a[8] * b3) * a[7]
+        b1 = (b1 - a[5] * b2 - a[6] * b3) * a[4]
+        b0 = (b0 - a[1] * b1 - a[2] * b2 - a[3] * b3) * a[0]
+        z[0] += omega * (b0 - z[0])
+        z[1] += omega * (b1 - z[1])
+        z[2] += omega * (b2 - z[2])
+        z[3] += omega * (b3 - z[3])
+        z[4] += omega * (b4 * a[10] - z[4])
 
 
 @parallel
-def _right_side(field: np.ndarray, systems: np.ndarray, out: np.ndarray) -> None:
-    """A z - b for the unknowns of `field`: what A z_new must be where nothing is smooth."""
-    _, height, width = field.shape
-    for y in prange(height):
-        for x in range(width):
-            s = systems[y, x]
-            z0, z1, z2, z3 = field[0, y, x], field[2, y, x], field[3, y, x], field[4, y, x]
-            out[y, x, 0] = s[0] * z0 + s[1] * z1 + s[2] * z2 + s[3] * z3 - s[10]
-            out[y, x, 1] = s[1] * z0 + s[4] * z1 + s[5] * z2 + s[6] * z3 - s[11]
-            out[y, x, 2] = s[2] * z0 + s[5] * z1 + s[7] * z2 + s[8] * z3 - s[12]
-            out[y, x, 3] = s[3] * z0 + s[6] * z1 + s[8] * z2 + s[9] * z3 - s[13]
-            out[y, x, 4] = s[14] * field[1, y, x] - s[15]
+def _sweep(
+    field: np.ndarray, prepared: np.ndarray, weights: np.ndarray, omega: np.float32, bands: np.ndarray
+) -> None:
+    """One sweep, first colour 0 and then colour 1, in one pass through memory.
+
+    Colour 1 follows colour 0 a row behind. A band's outermost rows wait for colour 0 of the bands around it, so that
+    the result is that of two half sweeps, whatever the bands.
+    """
+    for band in prange(len(bands) - 1):
+        for y in range(bands[band], bands[band + 1]):
+            _sweep_row(field, prepared, weights, y, 0, omega)
+            if y > bands[band] + 1:
+                _sweep_row(field, prepared, weights, y - 1, 1, omega)
+    for band in prange(len(bands) - 1):
+        first, last = bands[band], bands[band + 1] - 1
+        _sweep_row(field, prepared, weights, first, 1, omega)
+        if last > first:
+            _sweep_row(field, prepared, weights, last, 1, omega)
 
 
 @dataclass(frozen=True)
@@ -175,19 +216,18 @@ def relax(
         Data, smoothness and pull at the state that came in.
     """
     height, width = state.shape[1:]
-    field = state - reference
-    weights, rows = np.empty((height, width, 2 * GROUPS), np.float32), np.empty(height)
+    field, rows = np.zeros((height + 2, width + 2, 5), np.float32), np.empty(height)
+    weights = np.zeros((height + 1, width + 1, 2 * GROUPS), np.float32)
+    prepared = np.empty((height, width, PREPARED), np.float32)
     lambdas = np.array([config.disparity, config.change, config.flow, config.disparity], np.float32)
+    _subtract(state, reference, field)
     _smoothness_weights(field, edges, edges2, lambdas, np.float32(config.eps_px**2), weights, rows)
-    data = systems[..., 16] + systems[..., 17]
-    corrections = pull * np.stack([field[0] ** 2, field[2] ** 2, field[3] ** 2 + field[4] ** 2, field[1] ** 2], axis=-1) / 2
-    energy = total(data) + float(rows.cumsum()[-1]) + total(corrections.sum(axis=-1))
-    right_side = np.empty((height, width, 5), np.float32)
-    _right_side(field, systems, right_side)
+    _prepare(field, systems, weights, pull, prepared, rows)
     for _ in range(config.sweeps):
-        for colour in (0, 1):
-            _sweep(field, systems, right_side, weights, pull, colour, np.float32(config.omega))
-    return reference + field, energy
+        _sweep(field, prepared, weights, np.float32(config.omega), band_edges(height))
+    relaxed = np.empty_like(state)
+    _add(reference, field, relaxed)
+    return relaxed, float(rows.cumsum()[-1])
 
 
 @dataclass(frozen=True)
