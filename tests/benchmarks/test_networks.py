@@ -1,0 +1,131 @@
+"""Time of the networks and of guided aggregation on two threads, warm, at 384 x 1248; peak memory of the deep GA-Net.
+
+``python -m tests.benchmarks.test_networks [CASE ...]`` prints one line a case (no CASE: all, about two minutes), and for
+the aggregation the speed-up over the torch reference; ``pytest tests/benchmarks/test_networks.py`` records the same.
+"""
+
+import resource
+import sys
+from time import perf_counter
+
+import numba
+import pytest
+import torch
+
+from learned import ganet, pwcnet
+from learned.feedforward import FeedforwardModule, fold_normalisation
+from learned.guided_aggregation import semi_global_aggregation, semi_global_aggregation_reference
+
+SIZE = (384, 1248)
+COSTS = (1, 32, 65, 64, 208)
+"""A semi-global layer's costs: the deep model's channels and disparities, on a sixth of its pixels: the reference fits."""
+THREADS = min(2, numba.config.NUMBA_NUM_THREADS)
+
+
+def images(size, count):
+    """Seeded noise at a quarter of the size, enlarged."""
+    noise = torch.rand((count, 1, 3, size[0] // 4, size[1] // 4), generator=torch.Generator().manual_seed(1))
+    return [torch.nn.functional.interpolate(image, size, mode="bilinear", align_corners=False) for image in noise]
+
+
+def network(build, config, dtype, passes):
+    """A function of no arguments, warmed up at a small size: `passes` passes of a folded network."""
+    torch.manual_seed(3)
+    net = fold_normalisation(build(config).eval())
+
+    @torch.inference_mode()
+    def run(size=SIZE):
+        first, second, *_ = images(size, 2)
+        with torch.autocast("cpu", torch.bfloat16, enabled=dtype == torch.bfloat16):
+            return net.both_ways(first, second) if passes == 2 else net(first, second)
+
+    run((96, 192))
+    return run
+
+
+def feedforward():
+    torch.manual_seed(3)
+    networks = (fold_normalisation(net.eval()) for net in (ganet.GANet(ganet.COMPACT), pwcnet.PWCNet(pwcnet.COMPACT)))
+    module = FeedforwardModule(*networks, "bfloat16").eval()
+
+    @torch.inference_mode()
+    def run():
+        return module(*images(SIZE, 4))
+
+    return run
+
+
+def aggregation(function, backward):
+    generator = torch.Generator().manual_seed(2)
+    cost = torch.randn(COSTS, generator=generator)
+    batch, channels, _, height, width = COSTS
+    guidance = torch.randn((batch, 20 * channels, height, width), generator=generator)
+    cost.requires_grad_(backward)
+    guidance.requires_grad_(backward)
+
+    def run():
+        out = function(cost, guidance)
+        if backward:
+            torch.autograd.grad(out.sum(), (cost, guidance))
+
+    return run
+
+
+FLOAT, HALF = torch.float32, torch.bfloat16
+CASES = {
+    "pwcnet float32": lambda: network(pwcnet.PWCNet, pwcnet.PWCNetConfig(), FLOAT, 1),
+    "pwcnet bfloat16": lambda: network(pwcnet.PWCNet, pwcnet.PWCNetConfig(), HALF, 1),
+    "compact disparity": lambda: network(ganet.GANet, ganet.COMPACT, HALF, 1),
+    "compact flow": lambda: network(pwcnet.PWCNet, pwcnet.COMPACT, HALF, 1),
+    "compact flow both ways": lambda: network(pwcnet.PWCNet, pwcnet.COMPACT, HALF, 2),
+    "compact feedforward": feedforward,
+    "aggregation forward": lambda: aggregation(semi_global_aggregation, False),
+    "aggregation forward, reference": lambda: aggregation(semi_global_aggregation_reference, False),
+    "aggregation and backward": lambda: aggregation(semi_global_aggregation, True),
+    "aggregation and backward, reference": lambda: aggregation(semi_global_aggregation_reference, True),
+    "ganet deep float32": lambda: network(ganet.GANet, ganet.GANetConfig(), FLOAT, 1),
+    "ganet deep bfloat16": lambda: network(ganet.GANet, ganet.GANetConfig(), HALF, 1),
+}
+ROUNDS = {"ganet deep float32": 1, "ganet deep bfloat16": 1, "aggregation forward, reference": 2,
+          "aggregation and backward, reference": 2}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_pass(benchmark, case):
+    before = torch.get_num_threads()
+    torch.set_num_threads(THREADS)
+    benchmark.pedantic(CASES[case](), rounds=ROUNDS.get(case, 5), warmup_rounds=0 if "deep" in case else 1)
+    torch.set_num_threads(before)
+
+
+def seconds(case):
+    """The best of a few rounds, and the last result; the deep model runs once, warmed up at a small size."""
+    function = CASES[case]()
+    if "deep" not in case:
+        function()
+    times = []
+    for _ in range(ROUNDS.get(case, 5)):
+        start = perf_counter()
+        result = function()
+        times.append(perf_counter() - start)
+    return min(times), result
+
+
+def report(names):
+    """Print the table."""
+    torch.set_num_threads(THREADS)
+    times, disparities = {}, {}
+    for name in names:
+        times[name], disparities[name] = seconds(name)
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+        print(f"{name:36} {1000 * times[name]:9.1f} ms   peak of the process so far {peak:.2f} GB", flush=True)
+        fast, slow = name.removesuffix(", reference"), name
+        if fast != slow and fast in times:
+            print(f"{fast:36} {times[slow] / times[fast]:9.1f} times the reference", flush=True)
+    deep = [disparities[name] for name in disparities if "deep" in name]
+    if len(deep) == 2:
+        print(f"ganet deep, bfloat16 against float32: {(deep[0] - deep[1]).abs().mean():.4f} px on average")
+
+
+if __name__ == "__main__":
+    report(sys.argv[1:] or list(CASES))
