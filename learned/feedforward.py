@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from contextlib import AbstractContextManager
 from itertools import pairwise
-from typing import Literal, Protocol
+from typing import Literal, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor, nn
@@ -23,6 +23,13 @@ class MotionNetwork(Protocol):
     """Whatever maps (first, second) to (B, 3, H, W): u, v and the disparity change, in pixels, at first's pixels."""
 
     def __call__(self, first: Tensor, second: Tensor) -> Tensor: ...
+
+
+@runtime_checkable
+class SharedMotionNetwork(Protocol):
+    """A motion network that may have a cheaper way to both directions; the same results up to rounding."""
+
+    def both_ways(self, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]: ...
 
 
 class FeedforwardModule(nn.Module):
@@ -57,13 +64,19 @@ class FeedforwardModule(nn.Module):
         """
         with self._mixed(left1.device):
             d1, d2 = self.disparity(left1, right1), self.disparity(left2, right2)
-            forward, backward = self.motion(left1, left2), self.motion(left2, left1)
+            forward, backward = self._motions(left1, left2)
         size = left1.shape[0], *left1.shape[2:]
         if d1.shape != size or forward.shape != (size[0], 3, *size[1:]):
             raise ValueError(f"networks must return disparity {size} and motion {(size[0], 3, *size[1:])}, "
                              f"not {tuple(d1.shape)} and {tuple(forward.shape)}")
         u, v, change = forward.unbind(1)
         return torch.stack([d1, d2, change, u, v], 1), backward[:, :2]
+
+    def _motions(self, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
+        """Motion there and back; a network that can share work between the two is asked for both at once."""
+        if isinstance(self.motion, SharedMotionNetwork):
+            return self.motion.both_ways(first, second)
+        return self.motion(first, second), self.motion(second, first)
 
     def _mixed(self, device: torch.device) -> AbstractContextManager[None]:
         return torch.autocast(device.type, torch.bfloat16, enabled=self.precision == "bfloat16")

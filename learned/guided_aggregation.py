@@ -6,8 +6,10 @@ on any device and in any dtype; on the CPU in float32 the kernels of ``learned.g
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -76,8 +78,9 @@ class _SemiGlobal(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, cost: Tensor, guidance: Tensor) -> Tensor:
         planes = _planes(cost)
-        weights = guidance.detach().movedim(1, -1).contiguous().unflatten(3, (len(DIRECTIONS), TERMS, -1))
-        out = torch.full_like(planes, -torch.inf)
+        weights = guidance.detach().movedim(1, -1)
+        weights = _large(weights.shape).copy_(weights).unflatten(3, (len(DIRECTIONS), TERMS, -1))
+        out = _large(planes.shape).fill_(-torch.inf)
         # which of the four directions won: only the backward pass asks
         chosen = torch.zeros(planes.shape if any(ctx.needs_input_grad) else (0, 0, 0), dtype=torch.uint8)
         kernels.semi_global_forward(planes.numpy(), weights.numpy(), out.numpy(), chosen.numpy())
@@ -87,17 +90,23 @@ class _SemiGlobal(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor]:
         planes, weights, chosen = ctx.saved_tensors
-        to_planes, to_weights = torch.zeros_like(planes), torch.empty_like(weights)
+        to_planes, to_weights = _large(planes.shape).zero_(), _large(weights.shape)
         kernels.semi_global_backward(planes.numpy(), weights.numpy(), chosen.numpy(), _planes(gradient).numpy(),
                                      to_planes.numpy(), to_weights.numpy())
         return _volume(to_planes, gradient), to_weights.flatten(3).movedim(-1, 1)
+
+
+def _large(shape: Sequence[int]) -> Tensor:
+    """An uninitialised float32 tensor in numpy's memory, which asks for huge pages: a step of a sweep touches as many
+    pages as there are disparities."""
+    return torch.from_numpy(np.empty(tuple(shape), np.float32))
 
 
 def _planes(volume: Tensor) -> Tensor:
     """(B, C, D, H, W) -> (B, D, H * W * C + padding) float32, the layout of the kernels."""
     batch, channels, depth, height, width = volume.shape
     plane = height * width * channels
-    planes = torch.empty((batch, depth, plane + kernels.padding(plane)))
+    planes = _large((batch, depth, plane + kernels.padding(plane)))
     _volume(planes, volume).copy_(volume.detach())
     return planes
 

@@ -33,6 +33,16 @@ def test_any_size_goes_in_and_comes_out(height, width):
 
 
 @torch.no_grad()
+def test_both_ways_are_two_passes():
+    first, second, *_ = _images(61, 75, batch=2)
+    net = _seeded(PWCNet, SMALL_MOTION).eval()
+    forward, backward = net.both_ways(first, second)
+    torch.testing.assert_close(forward, net(first, second), rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(backward, net(second, first), rtol=1e-4, atol=1e-4)
+    assert not torch.allclose(forward, backward, atol=0.01)
+
+
+@torch.no_grad()
 def test_padding_does_not_move_the_image():
     """What lies far from the added border is what an unpadded image gives."""
     net = _seeded(PWCNet, SMALL_MOTION).eval()
