@@ -19,7 +19,10 @@ def _front(disparity: np.ndarray, u: np.ndarray, v: np.ndarray, bands: np.ndarra
         first, last = bands[band], bands[band + 1]
         for y in range(height):
             for x in range(width):
-                to_x, to_y = int(np.floor(x + u[y, x])), int(np.floor(y + v[y, x]))
+                to_y = int(np.floor(y + v[y, x]))
+                if to_y + 1 < first or to_y >= last:
+                    continue
+                to_x = int(np.floor(x + u[y, x]))
                 for j in range(max(to_y, first), min(to_y + 2, last)):
                     for i in range(max(to_x, 0), min(to_x + 2, width)):
                         if disparity[y, x] > front[j, i]:
@@ -75,9 +78,13 @@ def _backward(
         first, last = bands[band], bands[band + 1]
         for y in range(height):
             for x in range(width):
-                at_x, at_y = x + u[y, x], y + v[y, x]
-                to_x, to_y = int(np.rint(at_x)), int(np.rint(at_y))
-                if first <= to_y < last and 0 <= to_x < width and disparity[y, x] >= front[to_y, to_x] - margin:
+                at_y = y + v[y, x]
+                to_y = int(np.rint(at_y))
+                if not first <= to_y < last:
+                    continue
+                at_x = x + u[y, x]
+                to_x = int(np.rint(at_x))
+                if 0 <= to_x < width and disparity[y, x] >= front[to_y, to_x] - margin:
                     distance = (at_x - to_x) ** 2 + (at_y - to_y) ** 2
                     if distance < best[to_y, to_x]:
                         best[to_y, to_x] = distance

@@ -111,8 +111,8 @@ def _systems(
             s = systems[y, x]
             s[:] = 0
             d1, d2, change = state[0, y, x], state[1, y, x], state[2, y, x]
-            to_x, to_y = x + state[3, y, x], y + state[4, y, x]
-            px, py = np.float32(x), np.float32(y)
+            px, py = np.float32(x), np.float32(y)  # an integer plus a float32 would be float64
+            to_x, to_y = px + state[3, y, x], py + state[4, y, x]
             if seen_right1[y, x] and _compare(left1, right1, x, y, px - d1, py, weights[0], zeta2, eps2, pair):
                 s[0] += pair[0]
                 s[10] -= pair[3]
