@@ -42,6 +42,8 @@ class Method:
         ``module:Class``, the dataclass of its settings.
     fixed : dict
         Settings that make this method of several that share a function; a preset cannot change them.
+    starts : tuple of str
+        Tables of a preset that fill the settings of the same names: of the methods that this one may start from.
     """
 
     function: str
@@ -49,12 +51,18 @@ class Method:
     section: str | None = None
     config: str | None = None
     fixed: tuple[tuple[str, Any], ...] = ()
+    starts: tuple[str, ...] = ()
 
 
 def _composition(flow: str, filtered: bool) -> Method:
     text = f"OpenCV: semi-global matching{', filtered,' if filtered else ''} and {flow} flow"
     fixed = (("flow", flow), ("filtered", filtered))
     return Method("cgsf.baselines:compose", text, "opencv", "cgsf.baselines:CompositionConfig", fixed)
+
+
+def _refined(initial: str, summary: str) -> Method:
+    starts = ("feedforward", "variational", "opencv")
+    return Method("cgsf.refined:run_refined", summary, "refined", "cgsf.refined:RefinedConfig", (("initial", initial),), starts)
 
 
 METHODS: dict[str, Method] = {
@@ -68,6 +76,8 @@ METHODS: dict[str, Method] = {
     "feedforward": Method(
         "cgsf.feedforward:run_networks", "the networks alone", "feedforward", "cgsf.feedforward:FeedforwardConfig",
     ),
+    "hybrid": _refined("feedforward", "the networks, then the learned refiner"),
+    "variational+refiner": _refined("variational", "energy minimisation, then the learned refiner"),
     "zero": Method("cgsf.baselines:nothing", "zero everywhere"),
 }  # fmt: skip
 
@@ -160,7 +170,26 @@ def load_config(method: str, preset: str = "default") -> Any:
         raise InputError(f"preset {preset}: unknown table {unknown[0]!r}; there are {', '.join(sorted(sections))}")
     if entry.config is None or entry.section is None:
         return None
-    return from_table(_load(entry.config), tables.get(entry.section, {}) | dict(entry.fixed), entry.section)
+    table = {name: tables[name] for name in entry.starts if name in tables}
+    return from_table(_load(entry.config), table | tables.get(entry.section, {}) | dict(entry.fixed), entry.section)
+
+
+def with_settings(config: Any, settings: dict[str, Any]) -> Any:
+    """The settings of a method with some of them replaced; None stands for those that shall stay as they are.
+
+    Raises
+    ------
+    InputError
+        For settings that this method does not have, or that do not fit together.
+    """
+    given = {name: value for name, value in settings.items() if value is not None}
+    missing = [name for name in given if not hasattr(config, name)]
+    if missing:
+        raise InputError(f"this method has no setting {missing[0]!r}; hybrid and variational+refiner have them all")
+    try:
+        return replace(config, **given) if given else config
+    except ValueError as error:
+        raise InputError(str(error)) from None
 
 
 def on_device(config: Any, device: str | None) -> Any:

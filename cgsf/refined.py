@@ -25,6 +25,9 @@ if TYPE_CHECKING:
     from learned.refiner import Refiner
 
 
+SHIPPED_REFINER = "refiner-variational"
+
+
 @dataclass(frozen=True)
 class RefinedConfig:
     """Start and refinement.
@@ -39,8 +42,8 @@ class RefinedConfig:
     steps : int
         Refinement steps; 0 takes the strategy's own number.
     refiner : str
-        The name of weights that ship (``learned/weights/NAME.safetensors``) or the path of a file; empty takes the ones
-        trained for this start.
+        The name of weights that ship (``learned/weights/NAME.safetensors``) or the path of a file; empty takes
+        the one that ships, which was trained on the solver's states.
     device : str
         Any device that torch knows, for networks and refiner.
     steps_picture : str
@@ -72,7 +75,7 @@ def run_refined(frames: Frames, config: RefinedConfig, camera: StereoCamera | No
     """Scene flow by a start and a refinement strategy; masks and confidence are the start's, but for what moved."""
     from learned.strategies import StrategyConfig, apply_strategy
 
-    refiner = load_refiner(config.refiner or _REFINERS[config.initial]) if config.strategy == "learned" else None
+    refiner = load_refiner(config.refiner or SHIPPED_REFINER) if config.strategy == "learned" else None
     begin = time.perf_counter()
     start = _START[config.initial](frames, config, camera, progress)
     seconds = {**start.seconds, "initial state": time.perf_counter() - begin}
@@ -151,10 +154,4 @@ def _opencv(frames: Frames, config: RefinedConfig, camera: StereoCamera | None, 
     return replace(compose(frames, config.opencv, camera, progress), backward_flow=reverse.flow)
 
 
-# opencv's errors resemble the solver's more than those of networks
-_REFINERS = {
-    "feedforward": "refiner-feedforward",
-    "variational": "refiner-variational",
-    "opencv": "refiner-variational",
-}
 _START = {"feedforward": _networks, "variational": _solver, "opencv": _opencv}

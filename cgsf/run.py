@@ -27,6 +27,7 @@ def run(
     calibration: str | Path | None = None,
     progress: pipelines.Progress | None = None,
     device: str | None = None,
+    settings: dict[str, Any] | None = None,
 ) -> SceneFlow:
     """Scene flow of four image files, with all its files.
 
@@ -44,6 +45,8 @@ def run(
     progress : callable, optional
     device : str, optional
         For methods with networks: any device of torch, as cpu, cuda or mps.
+    settings : dict, optional
+        Replace the preset's settings of the method; values that are None do not.
 
     Returns
     -------
@@ -55,6 +58,7 @@ def run(
         For whatever cannot be read, solved or written.
     """
     config = pipelines.on_device(pipelines.load_config(method, preset), device)
+    config = pipelines.with_settings(config, settings or {})
     with all_or_nothing(out) as folder:
         start = time.perf_counter()
         camera = None if calibration is None else Calibration.read(calibration)

@@ -26,7 +26,7 @@ import cgsf
 from cgsf.config import from_table, to_table
 from cgsf.datasets.sample import Truth
 from cgsf.errors import InputError
-from cgsf.feedforward import WEIGHTS
+from cgsf.feedforward import WEIGHTS, load_network
 from cgsf.formats.files import write_bytes
 from cgsf.metrics import Scores, score
 from cgsf.sample_cache import SampleCache
@@ -55,6 +55,8 @@ class Recipe:
     """Folder of the samples (`cgsf.sample_cache`)."""
     starts: str = ""
     """Refiner: folder of the states that it starts from (`cgsf.start_cache`)."""
+    weights: str = ""
+    """Begin with these (the name of ones that ship, or a .safetensors file) in place of random ones."""
     held_out: int = 16
     """The cache's first samples are for validation only."""
     batch: int = 4
@@ -144,7 +146,11 @@ def train(recipe: Recipe, folder: str | Path, seconds: float = float("inf"), pro
     if batches.count < 1:
         raise InputError(f"{recipe.cache}: all of its samples are held out ({recipe.held_out}): none to train with")
     torch.manual_seed(recipe.training.seed)
-    model = _NETWORKS[recipe.stage](recipe).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    model = _NETWORKS[recipe.stage](recipe)
+    if recipe.stage != "disparity":  # a layout of two-dimensional convolutions
+        model = model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    if recipe.weights:
+        _begin_with(model, recipe.weights)
     loss, validate = _STAGES[recipe.stage](recipe, batches)
     try:
         return fit(model, batches, loss, recipe.training, folder, validate, seconds, progress)
@@ -266,6 +272,14 @@ _NETWORKS = {
     "refiner": lambda recipe: Refiner(recipe.refiner),
 }
 _STAGES = {"flow": _flow_stage, "disparity": _disparity_stage, "refiner": _refiner_stage}
+
+
+def _begin_with(model: nn.Module, name: str) -> None:
+    given = load_network(name)
+    try:
+        model.load_state_dict(given.state_dict())
+    except RuntimeError as error:
+        raise InputError(f"{name}: weights of another network ({str(error).splitlines()[0]})") from None
 
 
 def _truth(batch: Batch) -> Tensor:

@@ -38,7 +38,7 @@ class StrategyConfig:
     """How to refine."""
     steps: int = 0
     """Steps; 0 takes the refiner's own number for learned, 100 for outputs, 50 for parameters."""
-    outputs_rate: float = 0.1
+    outputs_rate: float = 0.02
     """Adam's step on the state in pixels."""
     parameters_rate: float = 1e-5
     """Adam's step on the weights; larger ones unlearn what training has taught."""
