@@ -18,6 +18,7 @@ COMMANDS = {
     "run": ("run", "Scene flow of four images."),
     "evaluate": ("evaluate", "Score methods on a data set."),
     "report": ("report", "One table over several data sets, beside OpenCV's compositions."),
+    "cache": ("cache", "Samples and starts on disk, for training."),
     "train": ("train", "Train a network or a refiner by a recipe."),
     "demo": ("demo", "Make a small stereo video, solve it, score it: needs no data."),
     "import-weights": ("import_weights", "Published GA-Net and PWC-Net checkpoints for this program."),

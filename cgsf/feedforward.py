@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -16,6 +17,8 @@ from variational.terms.visibility import visible_mask
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
+
+    from learned.feedforward import FeedforwardModule
 
 #: Weights that ship with the package are named by a bare word.
 WEIGHTS = Path(__file__).parents[1] / "learned" / "weights"
@@ -48,14 +51,14 @@ def run_networks(
     """Scene flow by the two networks; visible is what forward and backward flow agree on."""
     import torch
 
-    from learned.feedforward import FeedforwardModule, fold_normalisation, select_device
+    from learned.feedforward import select_device
 
     try:
         device = select_device(config.device)
     except ValueError as error:
         raise InputError(str(error)) from None
-    disparity, motion = (fold_normalisation(load_network(name)) for name in (config.disparity, config.motion))
-    module = FeedforwardModule(disparity, motion, config.precision).eval().to(device)
+    written = tuple(weights_path(name).stat().st_mtime_ns for name in (config.disparity, config.motion))
+    module = _load_module(config, written)
     with torch.inference_mode():
         state, backward = module(*(to_tensor(image).to(device) for image in (
             frames.left1, frames.right1, frames.left2, frames.right2)))
@@ -65,15 +68,29 @@ def run_networks(
     return SceneFlow.from_state(maps, visible, backward_flow=backward_flow)
 
 
+@lru_cache(maxsize=1)
+def _load_module(config: FeedforwardConfig, written: tuple[int, ...]) -> FeedforwardModule:
+    """Both networks, ready to run; kept for the next frame as long as the files are those `written` at these times."""
+    from learned.feedforward import FeedforwardModule, fold_normalisation
+
+    disparity, motion = (fold_normalisation(load_network(name)) for name in (config.disparity, config.motion))
+    return FeedforwardModule(disparity, motion, config.precision).eval().to(config.device)
+
+
+def weights_path(name: str) -> Path:
+    """Where the weights called `name` lie; `InputError` if there are none."""
+    path = Path(name) if name.endswith(".safetensors") else WEIGHTS / f"{name}.safetensors"
+    if not path.exists():
+        raise InputError(f"no weights {path}; train some, or import published ones with: cgsf import-weights")
+    return path
+
+
 def load_network(name: str) -> nn.Module:
     """A network in evaluation mode, from weights that ship or a file; `InputError` if there are none."""
     from learned.checkpoint import CheckpointError, load
 
-    path = Path(name) if name.endswith(".safetensors") else WEIGHTS / f"{name}.safetensors"
-    if not path.exists():
-        raise InputError(f"no weights {path}; train some, or import published ones with: cgsf import-weights")
     try:
-        return load(path)[0]
+        return load(weights_path(name))[0]
     except CheckpointError as error:
         raise InputError(str(error)) from None
 

@@ -8,7 +8,10 @@ A cache is a folder with ``images.npy`` (N, 4, H, W, 3) uint8 in the order left1
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+import os
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import ExitStack
+from multiprocessing import get_context
 from pathlib import Path
 
 import cv2
@@ -17,7 +20,9 @@ import numpy as np
 from cgsf.datasets.sample import Sample, Truth
 from cgsf.errors import InputError
 from cgsf.formats.files import write_bytes
+from cgsf.threads import bound_threads
 
+_DTYPES = {"images": np.uint8, "truth": np.float32}
 _INDEX = "cache.json"
 
 
@@ -56,7 +61,7 @@ class SampleCache:
 
 def write_cache(
     folder: str | Path, names: Sequence[str], make: Callable[[int], Sample], size: tuple[int, int],
-    progress: Callable[[int], None] | None = None,
+    progress: Callable[[int], None] | None = None, workers: int = 1,
 ) -> SampleCache:  # fmt: skip
     """Fill a cache with ``make(0) ... make(len(names) - 1)``; goes on where an earlier call was stopped.
 
@@ -65,35 +70,75 @@ def write_cache(
     names : sequence of str
         Of all samples.
     make : callable
-        Gives the sample of an index; larger ones are cut to `size` around their centre.
+        Gives the sample of an index; larger ones are cut to `size` around their centre. With several workers it is
+        pickled.
     size : (int, int)
         Height and width in pixels.
     progress : callable, optional
         Called with the number of samples that are complete.
+    workers : int
+        Processes that make samples; the files do not depend on it.
+
+    Raises
+    ------
+    InputError
+        If the folder holds another cache, a sample is too small, or the disk is full.
     """
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
+    folder, names = Path(folder), list(names)
+    done = _read_index(folder) if (folder / _INDEX).exists() else []
+    if done != names[: len(done)]:
+        raise InputError(f"{folder} holds a cache of other samples; choose another folder")
     shapes = {"images": (len(names), 4, *size, 3), "truth": (len(names), 5, *size)}
-    arrays = {}
-    for name, shape in shapes.items():
-        path, dtype = folder / f"{name}.npy", np.uint8 if name == "images" else np.float32
-        mode = "r+" if path.exists() else "w+"
-        arrays[name] = np.lib.format.open_memmap(path, mode=mode, dtype=dtype, shape=shape)
-        if arrays[name].shape != shape:
-            raise InputError(f"{folder} holds a cache of another size; choose another folder")
-    done = len(_read_index(folder)) if (folder / _INDEX).exists() else 0
-    for index in range(done, len(names)):
-        sample = make(index)
-        arrays["images"][index] = [_to_bytes(_centre(image, size)) for image in sample.images]
-        arrays["truth"][index] = _centre(truth_state(sample.truth, sample.left1.shape[:2]).transpose(1, 2, 0), size).transpose(
-            2, 0, 1
-        )
-        for array in arrays.values():
-            array.flush()
-        _write_index(folder, names[: index + 1])
-        if progress:
-            progress(index + 1)
+    arrays = {name: open_array(folder / f"{name}.npy", shape, _DTYPES[name]) for name, shape in shapes.items()}
+    if progress:
+        progress(len(done))
+    with ExitStack() as stack:
+        left = range(len(done), len(names))
+        made: Iterable[Sample] = map(make, left)
+        if workers > 1 and len(left) > 1:
+            made = stack.enter_context(get_context("spawn").Pool(workers, bound_threads, (1,))).imap(make, left)
+        for index, sample in zip(left, made, strict=True):
+            arrays["images"][index] = [_to_bytes(_centre(image, size)) for image in sample.images]
+            truth = truth_state(sample.truth, sample.left1.shape[:2])
+            arrays["truth"][index] = _centre(truth.transpose(1, 2, 0), size).transpose(2, 0, 1)
+            for array in arrays.values():
+                array.flush()
+            _write_index(folder, names[: index + 1])
+            if progress:
+                progress(index + 1)
     return SampleCache(folder)
+
+
+def open_array(path: Path, shape: tuple[int, ...], dtype: type) -> np.memmap:
+    """A ``.npy`` file on disk as a writable array: the one that is there, or a new one whose space is set aside, so that
+    a full disk shows now and not as a crash while it is filled.
+
+    Raises
+    ------
+    InputError
+        If the file is another array, or there is no space for it.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if not path.exists():
+        temporary = path.with_name(f".{path.name}.part")
+        array = np.lib.format.open_memmap(temporary, mode="w+", dtype=dtype, shape=shape)
+        try:
+            if hasattr(os, "posix_fallocate"):
+                with temporary.open("r+b") as file:
+                    os.posix_fallocate(file.fileno(), 0, array.offset + array.nbytes)
+            temporary.replace(path)
+        except OSError as error:
+            raise InputError(f"{path}: no space for {array.nbytes / 1e9:.1f} GB ({error.strerror})") from None
+        finally:
+            temporary.unlink(missing_ok=True)
+        return array
+    try:
+        array = np.lib.format.open_memmap(path, mode="r+")
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be continued ({error}); choose another folder") from None
+    if array.shape != shape or array.dtype != dtype:
+        raise InputError(f"{path.parent} holds a cache of another size; choose another folder")
+    return array
 
 
 def truth_state(truth: Truth | None, shape: tuple[int, int]) -> np.ndarray:

@@ -1,8 +1,8 @@
 """Starts for the refiner on disk: what a method makes of every sample of a `SampleCache`, computed once.
 
 A folder with ``start.npy`` (N, 5, H, W) float32, ``backward.npy`` (N, 2, H, W) float32 (flow left2 -> left1),
-``evidence.npy`` (N, 2, H, W) float32 (confidence and visibility in [0, 1]) and ``cache.json`` (the method, the samples
-that are complete).
+``evidence.npy`` (N, 2, H, W) float32 (confidence and visibility in [0, 1]) and ``cache.json``: what made them, and the
+names of the samples that are complete.
 """
 
 from __future__ import annotations
@@ -10,14 +10,15 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from cgsf.errors import InputError
 from cgsf.formats.files import write_bytes
-from cgsf.pipelines import load_config, solve
-from cgsf.sample_cache import SampleCache
-from cgsf.scene_flow import SceneFlow
+from cgsf.intake import to_frames
+from cgsf.sample_cache import SampleCache, open_array
+from cgsf.starts import StartConfig, describe, make_start, start_maps
 
 _ARRAYS = {"start": 5, "backward": 2, "evidence": 2}
 _INDEX = "cache.json"
@@ -28,7 +29,7 @@ class StartCache:
 
     def __init__(self, folder: str | Path) -> None:
         self.folder = Path(folder)
-        self.method, self.names = _read_index(self.folder)
+        self.about, self.names = _read_index(self.folder)
         try:
             self.maps = {name: np.load(self.folder / f"{name}.npy", mmap_mode="r", allow_pickle=False) for name in _ARRAYS}
         except (OSError, ValueError) as error:
@@ -43,50 +44,54 @@ class StartCache:
 
 
 def write_starts(
-    folder: str | Path, cache: SampleCache, method: str, preset: str = "default", count: int | None = None,
+    folder: str | Path, cache: SampleCache, config: StartConfig, count: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> StartCache:  # fmt: skip
-    """Solve the first `count` samples of a cache with a method; goes on where an earlier call was stopped."""
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
+    """Make the starts of the first `count` samples of a cache; goes on where an earlier call was stopped.
+
+    Parameters
+    ----------
+    folder : str or Path
+    cache : SampleCache
+        No cameras are known there: the solver works as it does without a calibration.
+    config : StartConfig
+    count : int, optional
+        All samples unless given; may grow from call to call.
+    progress : callable, optional
+        Called with the number of starts that are complete.
+
+    Raises
+    ------
+    InputError
+        If the folder holds other starts or the disk is full; and whatever the start's maker refuses.
+    """
+    folder, about = Path(folder), describe(config)
     count = min(len(cache), count or len(cache))
-    config = load_config(method, preset)
-    arrays = {}
-    for name, channels in _ARRAYS.items():
-        path, shape = folder / f"{name}.npy", (len(cache.images), channels, *cache.images.shape[2:4])
-        mode = "r+" if path.exists() else "w+"
-        arrays[name] = np.lib.format.open_memmap(path, mode=mode, dtype=np.float32, shape=shape)
     done = 0
     if (folder / _INDEX).exists():
         made_by, names = _read_index(folder)
         done = len(names)
-        if made_by != method or names != cache.names[:done]:
-            raise InputError(f"{folder} holds starts of {made_by} for other samples; choose another folder")
+        if made_by != json.loads(json.dumps(about)) or names != cache.names[:done]:
+            raise InputError(f"{folder} holds starts made otherwise or of other samples; choose another folder")
+    size, total = cache.images.shape[2:4], len(cache.images)
+    arrays = [open_array(folder / f"{name}.npy", (total, channels, *size), np.float32) for name, channels in _ARRAYS.items()]
+    if progress:
+        progress(done)
     for index in range(done, count):
-        result = solve(list(cache[index][0]), method, config)
-        arrays["start"][index], arrays["backward"][index], arrays["evidence"][index] = start_of(result)
-        for array in arrays.values():
+        start = make_start(to_frames(list(cache[index][0])), config)
+        for array, maps in zip(arrays, start_maps(start), strict=True):
+            array[index] = maps
             array.flush()
-        write_bytes(folder / _INDEX, json.dumps({"method": method, "names": cache.names[: index + 1]}).encode())
+        write_bytes(folder / _INDEX, json.dumps({"about": about, "names": cache.names[: index + 1]}).encode())
         if progress:
             progress(index + 1)
     return StartCache(folder)
 
 
-def start_of(result: SceneFlow) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """State (5, H, W), backward flow (2, H, W) and evidence (2, H, W) of a method's result, float32 and finite."""
-    if result.backward_flow is None:
-        raise InputError(f"the method {result.method!r} gives no backward flow: its states cannot be refined")
-    state = np.nan_to_num(result.state(), posinf=0, neginf=0)
-    backward = result.backward_flow.transpose(2, 0, 1)
-    confidence = np.ones(result.shape, np.float32) if result.confidence is None else result.confidence
-    return state, backward, np.stack([confidence, result.visible.astype(np.float32)])
-
-
-def _read_index(folder: Path) -> tuple[str, list[str]]:
+def _read_index(folder: Path) -> tuple[dict[str, Any], list[str]]:
     try:
         index = json.loads((folder / _INDEX).read_text())
-        return index["method"], list(index["names"])
+        return index["about"], list(index["names"])
     except FileNotFoundError:
         raise InputError(f"{folder} is no cache of starts: {_INDEX} is missing") from None
     except (ValueError, KeyError, TypeError):

@@ -29,24 +29,33 @@ def popcount(typing_context, word):  # type: ignore[no-untyped-def]
 
 
 @rowwise
-def _compare_row(centre: np.ndarray, other: np.ndarray, spacing: int, words: np.ndarray) -> None:
-    """Append a bit to each word for each neighbour in one row above, through or below it."""
+def _compare_row(centre: np.ndarray, other: np.ndarray, half_words: np.ndarray) -> None:
+    """Append one bit to each half word: is the neighbour in `other` darker than the centre?"""
+    for x in range(half_words.size):
+        half_words[x] = (half_words[x] << np.uint32(1)) | np.uint32(other[x] < centre[x])
+
+
+@rowwise
+def _join_halves(high: np.ndarray, low: np.ndarray, low_bits: int, words: np.ndarray) -> None:
     for x in range(words.size):
-        word, here = words[x], centre[x]
-        for i in range(2 * CENSUS_COLUMNS + 1):
-            word = (word << np.uint64(1)) | np.uint64(other[x + i * spacing] < here)
-        words[x] = word
+        words[x] = (np.uint64(high[x]) << np.uint64(low_bits)) | np.uint64(low[x])
 
 
 @parallel
 def _census(padded: np.ndarray, spacing: int, words: np.ndarray) -> None:
+    """One neighbour after the other over a whole row: halves of words are as wide as the image's numbers, so that a
+    comparison and a shift are one vector instruction each."""
     height, width = words.shape
+    columns = 2 * CENSUS_COLUMNS + 1
+    neighbours = columns * (2 * CENSUS_ROWS + 1)
     for y in prange(height):
-        words[y] = 0
         left = CENSUS_COLUMNS * spacing
         centre = padded[y + CENSUS_ROWS * spacing, left : left + width]
-        for i in range(2 * CENSUS_ROWS + 1):
-            _compare_row(centre, padded[y + i * spacing], spacing, words[y])
+        halves = np.zeros((2, width), np.uint32)
+        for n in range(neighbours):
+            begin = n % columns * spacing
+            _compare_row(centre, padded[y + n // columns * spacing, begin : begin + width], halves[n // 32])
+        _join_halves(halves[0], halves[1], neighbours - 32, words[y])
 
 
 def census(grey: np.ndarray) -> np.ndarray:

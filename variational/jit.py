@@ -1,10 +1,11 @@
 """How kernels are compiled: the only place with numba's flags.
 
-Three kinds of kernel, from the inside out:
+Four kinds of kernel, from the inside out:
 
 * ``@scalar``   a few operations on numbers, inlined by LLVM into whoever calls it;
 * ``@rowwise``  a loop over one image row, or a band of rows; its array arguments **must not overlap**, which is
   promised to LLVM, and without which it would vectorise neither a loop with many streams nor one that gathers;
+* ``@inlined``  the same, merged into its caller: for a loop so short that handing over its arrays would cost as much;
 * ``@parallel`` the outermost loop, ``prange`` over bands of rows.
 
 Results have the same bits for any number of threads, by construction: every output pixel is written by one band, with
@@ -25,7 +26,7 @@ from numba import get_num_threads, njit, prange, types
 from numba.core.compiler import CompilerBase, DefaultPassBuilder
 from numba.extending import overload
 
-__all__ = ["band_edges", "parallel", "prange", "rowwise", "scalar", "total"]
+__all__ = ["band_edges", "inlined", "parallel", "prange", "rowwise", "scalar", "total"]
 
 MIN_BAND_ROWS = 24
 """Rows below which a band is not worth its halo: the stencils recompute two rows on either side."""
@@ -45,6 +46,7 @@ _FLAGS: dict[str, Any] = {
 
 scalar = njit(**_FLAGS)
 rowwise = njit(**_FLAGS, pipeline_class=_NoAlias)
+inlined = njit(**_FLAGS, pipeline_class=_NoAlias, forceinline=True)
 parallel = njit(**_FLAGS, parallel=True)
 
 

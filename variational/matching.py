@@ -18,7 +18,7 @@ from numba import types
 from numba.extending import intrinsic
 
 from variational.census import census, stereo_costs
-from variational.jit import parallel, prange, rowwise, scalar
+from variational.jit import inlined, parallel, prange, rowwise, scalar
 
 UNREACHABLE = 12000
 """Above any path cost, and still inside 16 bits with a penalty added."""
@@ -97,60 +97,70 @@ def _min16(typing_context, a, b):  # type: ignore[no-untyped-def]
 
 
 @scalar
-def _path_cost(here: int, before: np.ndarray, d: int, small: int, jump: int, best: int) -> int:
-    """here + min(before, neighbours before + small, jump) - best; `before` begins at disparity -1."""
-    near = _add16(_min16(before[d], before[d + 2]), small)
-    return _add16(here, _sub16(_min16(_min16(before[d + 1], near), jump), best))
+def _path_cost(here: int, before: np.ndarray, x: int, d: int, small: int, jump: int, best: int) -> int:
+    """here + min(before, neighbours before + small, jump) - best; rows of `before` begin at disparity -1."""
+    near = _add16(_min16(before[x, d], before[x, d + 2]), small)
+    return _add16(here, _sub16(_min16(_min16(before[x, d + 1], near), jump), best))
 
 
-@rowwise
+@inlined
 def _extend(
-    cost: np.ndarray, before0: np.ndarray, before1: np.ndarray, before2: np.ndarray, before3: np.ndarray, best0: int,
-    best1: int, best2: int, best3: int, small: int, large_x: int, large_y: int, now0: np.ndarray, now1: np.ndarray,
-    now2: np.ndarray, now3: np.ndarray, total: np.ndarray,
+    costs: np.ndarray, x: int, step: int, before0: np.ndarray, before1: np.ndarray, before2: np.ndarray, before3: np.ndarray,
+    best0: int, best1: int, best2: int, best3: int, small: int, large_x: int, large_y: int, now0: np.ndarray,
+    now1: np.ndarray, now2: np.ndarray, now3: np.ndarray, totals: np.ndarray,
 ) -> tuple[np.int16, np.int16, np.int16, np.int16]:  # fmt: skip
-    """One pixel of four paths, the first along the row: adds their costs to `total`, returns their new bests.
+    """Pixel x of four paths, the first along the row: adds their costs to its totals, returns their new bests.
 
-    Flat arguments, because arrays inside of a tuple would lose the promise that they do not overlap.
+    Whole rows are handed over and indexed in here: a slice for each pixel would cost a reference count, which takes as
+    long as a dozen disparities.
     """
     jump0, jump1 = _add16(best0, large_x), _add16(best1, large_y)
     jump2, jump3 = _add16(best2, large_y), _add16(best3, large_y)
     least0 = least1 = least2 = least3 = np.int16(UNREACHABLE)
-    for d in range(cost.size):
-        here = np.int16(cost[d])
-        value0 = _path_cost(here, before0, d, small, jump0, best0)
-        value1 = _path_cost(here, before1, d, small, jump1, best1)
-        value2 = _path_cost(here, before2, d, small, jump2, best2)
-        value3 = _path_cost(here, before3, d, small, jump3, best3)
-        now0[d + 1], now1[d + 1], now2[d + 1], now3[d + 1] = value0, value1, value2, value3
+    at, behind, ahead = x + 1, x + 1 - step, x + 1 + step
+    for d in range(costs.shape[1]):
+        here = np.int16(costs[x, d])
+        value0 = _path_cost(here, before0, 0, d, small, jump0, best0)
+        value1 = _path_cost(here, before1, behind, d, small, jump1, best1)
+        value2 = _path_cost(here, before2, at, d, small, jump2, best2)
+        value3 = _path_cost(here, before3, ahead, d, small, jump3, best3)
+        now0[0, d + 1], now1[at, d + 1], now2[at, d + 1], now3[at, d + 1] = value0, value1, value2, value3
         least0, least1 = _min16(least0, value0), _min16(least1, value1)
         least2, least3 = _min16(least2, value2), _min16(least3, value3)
-        total[d] = _add16(total[d], _add16(_add16(value0, value1), _add16(value2, value3)))
+        totals[x, d] = _add16(totals[x, d], _add16(_add16(value0, value1), _add16(value2, value3)))
     return least0, least1, least2, least3
 
 
 @rowwise
 def _sweep_row(
-    costs: np.ndarray, large_x: np.ndarray, large_y: np.ndarray, small: int, step: int, before: np.ndarray,
-    before_best: np.ndarray, now: np.ndarray, now_best: np.ndarray, along: np.ndarray, totals: np.ndarray,
+    costs: np.ndarray, large_x: np.ndarray, large_y: np.ndarray, small: int, step: int, before1: np.ndarray,
+    before2: np.ndarray, before3: np.ndarray, before_best: np.ndarray, now1: np.ndarray, now2: np.ndarray,
+    now3: np.ndarray, now_best: np.ndarray, even: np.ndarray, odd: np.ndarray, totals: np.ndarray,
 ) -> None:  # fmt: skip
     """Add one row's four path costs to totals (W, D); step = 1 comes from the top left, -1 from the bottom right.
 
-    before, now (W + 2, 3, D + 2): path costs of the previous row and of this one. A path begins where the one before it
-    is all zeros: then its cost is the pixel's own. Columns 0 and W + 1 stay zero for that.
+    before*, now* (W + 2, D + 2): path costs of the previous row and of this one. A path begins where the one before it
+    is all zeros: then its cost is the pixel's own. Columns 0 and W + 1 stay zero for that. even, odd (1, D + 2): the
+    path along the row, of the pixel before and of this one in turn.
     """
     width = costs.shape[0]
-    along_best = np.int16(0)
-    along[:, 1:-1] = 0
+    best = np.int16(0)
+    even[:, 1:-1] = 0
     for j in range(width):
         x = j if step == 1 else width - 1 - j
-        behind, ahead = x + 1 - step, x + 1 + step
-        along_best, now_best[x + 1, 0], now_best[x + 1, 1], now_best[x + 1, 2] = _extend(
-            costs[x], along[j % 2], before[behind, 0], before[x + 1, 1], before[ahead, 2],
-            along_best, before_best[behind, 0], before_best[x + 1, 1], before_best[ahead, 2],
-            small, large_x[x if step == 1 else x + 1], large_y[x],
-            along[(j + 1) % 2], now[x + 1, 0], now[x + 1, 1], now[x + 1, 2], totals[x],
-        )  # fmt: skip
+        at, behind, ahead = x + 1, x + 1 - step, x + 1 + step
+        large = large_x[x if step == 1 else x + 1]
+        best1, best2, best3 = before_best[behind, 0], before_best[at, 1], before_best[ahead, 2]
+        if j % 2 == 0:
+            best, now_best[at, 0], now_best[at, 1], now_best[at, 2] = _extend(
+                costs, x, step, even, before1, before2, before3, best, best1, best2, best3, small, large, large_y[x],
+                odd, now1, now2, now3, totals,
+            )  # fmt: skip
+        else:
+            best, now_best[at, 0], now_best[at, 1], now_best[at, 2] = _extend(
+                costs, x, step, odd, before1, before2, before3, best, best1, best2, best3, small, large, large_y[x],
+                even, now1, now2, now3, totals,
+            )  # fmt: skip
 
 
 @rowwise
@@ -207,11 +217,11 @@ def _aggregate(
     large_y[y, x] between (x, y - 1) and (x, y); both have one more column or row for the first step of k = 1.
     """
     height, width, disparities = costs.shape
-    # Path costs of two rows: (k, parity, x + 1, path, d + 1), unreachable beyond both ends of d, zero before the start.
-    paths = np.full((2, 2, width + 2, 3, disparities + 2), np.int16(UNREACHABLE), np.int16)
+    # Path costs of two rows: (k, parity, path, x + 1, d + 1), unreachable beyond both ends of d, zero before the start.
+    paths = np.full((2, 2, 3, width + 2, disparities + 2), np.int16(UNREACHABLE), np.int16)
     paths[..., 1:-1] = 0
     best = np.zeros((2, 2, width + 2, 3), np.int16)
-    along = np.full((2, 2, disparities + 2), np.int16(UNREACHABLE), np.int16)
+    along = np.full((2, 2, 1, disparities + 2), np.int16(UNREACHABLE), np.int16)
     right = np.empty((2, 2, width + disparities), np.int16)
     for half in range(2):
         for k in prange(2):
@@ -219,9 +229,10 @@ def _aggregate(
             for i in range(half * meeting, meeting if half == 0 else height):
                 y = i if k == 0 else height - 1 - i
                 now, before = i % 2, (i + 1) % 2
+                last, new = paths[k, before], paths[k, now]
                 _sweep_row(
-                    costs[y], large_x[y], large_y[y + k], small, 1 - 2 * k, paths[k, before], best[k, before],
-                    paths[k, now], best[k, now], along[k], totals[y],
+                    costs[y], large_x[y], large_y[y + k], small, 1 - 2 * k, last[0], last[1], last[2], best[k, before],
+                    new[0], new[1], new[2], best[k, now], along[k, 0], along[k, 1], totals[y],
                 )  # fmt: skip
                 if half == 1:
                     _select_row(totals[y], tolerance, uniqueness, right[k, 0], right[k, 1], disparity[y], matched[y])
@@ -304,7 +315,7 @@ def find_max_disparity(left: np.ndarray, right: np.ndarray, config: MatchingConf
     costs = stereo_costs(census(small[0]), census(small[1]), searched)
     disparity, matched = aggregate(costs, small[0], config)
     found = np.percentile(disparity[matched], 99.8) if matched.any() else searched / 2
-    return int(min(width - 1, 16 * np.ceil((4 * found + 8) / 16)))
+    return int(min(width, 16 * np.ceil((4 * found + 9) / 16)) - 1)  # so that the disparities fill whole vectors
 
 
 def match(left: np.ndarray, right: np.ndarray, config: MatchingConfig) -> StereoMatch:

@@ -1,12 +1,8 @@
 """``cgsf evaluate``: scores of methods on a data set."""
 
-import tomllib
-from typing import Any
-
 import click
 
-from cgsf.commands.options import method_option, preset_option
-from cgsf.errors import InputError
+from cgsf.commands.options import dataset_options, method_option, parse_options, preset_option
 
 
 @click.command(short_help="Score methods on a data set.")
@@ -15,7 +11,7 @@ from cgsf.errors import InputError
 @click.option("-o", "--output", required=True, metavar="OUT", help="Folder for predictions and tables.")
 @method_option(multiple=True)
 @preset_option
-@click.option("--option", "options", multiple=True, metavar="NAME=VALUE", help="Of the data set, as split=training.")
+@dataset_options
 @click.option("--keep-going", is_flag=True, help="Leave bad frames out in place of stopping.")
 @click.option("--initial", is_flag=True, help="Score the states that the methods start from, too.")
 @click.option("--pictures", is_flag=True, help="An overview.png for every new prediction.")
@@ -32,7 +28,7 @@ def command(
     from cgsf.datasets import open_dataset
     from cgsf.evaluate import evaluate
 
-    samples = open_dataset(dataset, root, **dict(_option(text) for text in options))
+    samples = open_dataset(dataset, root, **parse_options(options))
     report = evaluate(
         samples, dataset, output, method, preset, keep_going=keep_going, initial=initial, pictures=pictures,
         watch=lambda indices: tqdm(indices, desc=dataset, unit="frame", disable=None),
@@ -40,14 +36,3 @@ def command(
     click.echo(report.table())
     for name, message in report.failures.items():
         click.echo(f"left out {name}: {message}", err=True)
-
-
-def _option(text: str) -> tuple[str, Any]:
-    """``name=value`` with a TOML value, or a bare word for a string."""
-    name, equals, value = text.partition("=")
-    if not equals or not name.isidentifier():
-        raise InputError(f"--option must be NAME=VALUE, got {text!r}")
-    try:
-        return name, tomllib.loads(f"value = {value}")["value"]
-    except tomllib.TOMLDecodeError:
-        return name, value

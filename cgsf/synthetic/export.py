@@ -21,6 +21,7 @@ from cgsf.errors import InputError
 from cgsf.formats import kitti_png
 from cgsf.formats.files import write_bytes
 from cgsf.formats.images import to_bytes, write_png
+from cgsf.synthetic.families import FAMILIES
 from cgsf.synthetic.render import make_sample
 
 Progress = Callable[[int], None]
@@ -124,14 +125,20 @@ def _calibration_text(camera: Calibration) -> str:
 
 def write_cache(
     folder: str | Path, families: Sequence[str], count: int, seed: int, height: int, width: int,
-    progress: Progress | None = None, **options: Any,
+    progress: Progress | None = None, workers: int = 1, **options: Any,
 ) -> None:  # fmt: skip
     """Render samples into a training cache, see `cgsf.sample_cache`.
 
     The families take turns, then the seed grows by one; the other arguments and errors are those of `write_kitti`.
     """
+    unknown = [family for family in families if family not in FAMILIES]
+    if unknown:
+        raise InputError(f"unknown family {unknown[0]!r}; known are {', '.join(sorted(FAMILIES))}")
     scenes = [(families[index % len(families)], seed + index // len(families)) for index in range(count)]
     names = [f"{family}-{number:06d}" for family, number in scenes]
-    sample_cache.write_cache(
-        folder, names, lambda index: make_sample(*scenes[index], height, width, **options), (height, width), progress
-    )
+    make = partial(_turn, families=tuple(families), seed=seed, size=(height, width), options=options)
+    sample_cache.write_cache(folder, names, make, (height, width), progress, workers)
+
+
+def _turn(index: int, families: tuple[str, ...], seed: int, size: tuple[int, int], options: dict[str, Any]) -> Sample:
+    return make_sample(families[index % len(families)], seed + index // len(families), *size, **options)

@@ -14,14 +14,15 @@ from cgsf.errors import InputError
 from cgsf.refined import RefinedConfig, run_refined
 from cgsf.sample_cache import SampleCache, write_cache
 from cgsf.start_cache import StartCache, write_starts
+from cgsf.starts import StartConfig
 from cgsf.training import Recipe, export_best, read_recipe, train, with_changes
 from learned.augment import AugmentConfig
 from learned.checkpoint import ModelCard, save
-from learned.ganet import GANetConfig
 from learned.pwcnet import PWCNet, PWCNetConfig
 from learned.refiner import COMPACT, Refiner
 from learned.training import TrainingConfig
 from tests.cgsf import scenes
+from tests.cgsf.test_caches import SMALL_GANET, SMALL_PWCNET
 
 SIZE = (64, 96)
 NAMES = [f"plane-{i}" for i in range(4)]
@@ -41,16 +42,14 @@ def make(index: int) -> Sample:
 def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("training")
     cache = write_cache(folder / "cache", NAMES, make, SIZE)
-    write_starts(folder / "starts", cache, "variational")
+    write_starts(folder / "starts", cache, StartConfig("variational"))
     return folder
 
 
 def recipe(folder, stage: str, **changes) -> Recipe:
     small = Recipe(
         stage, str(folder / "cache"), str(folder / "starts"), held_out=1, batch=2, refiner=SMALL_REFINER,
-        pwcnet=PWCNetConfig(pyramid=(4, 4, 8), convolutions=1, decoder=(8,), context=((8, 1),), cosine=True, residual=True),
-        ganet=GANetConfig(max_disparity=32, stem=((8, 3, 4),), features=(8,), unets=1, correlation_groups=4, volume=(4, 4),
-                          hourglasses=1, aggregated_levels=(0,), full_resolution_head=False),
+        pwcnet=SMALL_PWCNET, ganet=SMALL_GANET,
         augment=AugmentConfig(48, 64), training=TrainingConfig(steps=2, log_every=1, checkpoint_every=1, validate_every=2),
     )  # fmt: skip
     return dataclasses.replace(small, **changes)
@@ -169,7 +168,7 @@ def test_bad_input_is_one_clear_line(folder, tmp_path):
 
 
 def test_shipped_recipes_fit_the_shipped_networks():
-    for name in ("flow", "disparity", "refiner-variational"):
+    for name in ("flow", "disparity", "refiner-variational", "refiner-feedforward"):
         assert read_recipe(name).stage == name.split("-")[0]
     assert dataclasses.replace(read_recipe("refiner-variational").refiner, steps=COMPACT.steps) == COMPACT
 
