@@ -1,0 +1,133 @@
+"""Samples and starts on disk, from the command line: what they hold, how they go on, what they refuse."""
+
+import errno
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from click.testing import CliRunner, Result
+
+from cgsf.cli import main
+from cgsf.intake import to_frames
+from cgsf.sample_cache import SampleCache
+from cgsf.start_cache import StartCache
+from cgsf.starts import load_start_config, make_start
+from cgsf.synthetic import make_sample
+from learned.checkpoint import ModelCard, save
+from learned.ganet import GANet, GANetConfig
+from learned.pwcnet import PWCNet, PWCNetConfig
+from tests.cgsf import scenes
+
+SMALL_GANET = GANetConfig(max_disparity=32, stem=((8, 3, 4),), features=(8,), unets=1, correlation_groups=4, volume=(4, 4),
+                          hourglasses=1, aggregated_levels=(0,), full_resolution_head=False)  # fmt: skip
+SMALL_PWCNET = PWCNetConfig(pyramid=(4, 4, 8), convolutions=1, decoder=(8,), context=((8, 1),), cosine=True, residual=True)
+
+
+def call(*arguments: object) -> Result:
+    return CliRunner().invoke(main, ["cache", *(str(argument) for argument in arguments)])
+
+
+def weights(folder: Path, seed: int = 0) -> tuple[str, str]:
+    torch.manual_seed(seed)
+    save(GANet(SMALL_GANET), folder / "disparity.safetensors", ModelCard("a test"))
+    save(PWCNet(SMALL_PWCNET), folder / "flow.safetensors", ModelCard("a test"))
+    return str(folder / "disparity.safetensors"), str(folder / "flow.safetensors")
+
+
+@pytest.fixture(scope="module")
+def frames(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three real-life folders of four images, without truth."""
+    root = tmp_path_factory.mktemp("frames")
+    for index in range(3):
+        scenes.write_images(root / f"scene_{index}", scenes.plane(np.random.default_rng(index), 70, 100))
+    return root
+
+
+def test_rendered_samples_by_turns(tmp_path: Path):
+    arguments = ("samples", "-o", tmp_path / "c", "--family", "things", "--family", "street", "--size", "48x64", "--seed", 7)
+    assert call(*arguments, "--count", 3).exit_code == 0
+    cache = SampleCache(tmp_path / "c")
+    assert cache.names == ["things-000007", "street-000007", "things-000008"]
+    expected = make_sample("street", 7, 48, 64)
+    np.testing.assert_allclose(cache[1][0][3], 255 * expected.right2, atol=0.51)
+    np.testing.assert_array_equal(cache[1][1][0], expected.truth.disparity1)
+    again = call(*arguments, "--count", 3)
+    assert (again.exit_code, again.output.splitlines()[-1]) == (0, f"{tmp_path / 'c'}: 3 samples of 48 x 64 pixels")
+
+
+def test_several_workers_write_the_same_files(tmp_path: Path):
+    for workers in (1, 2):
+        more = ("--family", "things", "--size", "32x48", "--count", 2, "--workers", workers)
+        assert call("samples", "-o", tmp_path / str(workers), *more).exit_code == 0
+    for name in ("images.npy", "truth.npy", "cache.json"):
+        assert (tmp_path / "1" / name).read_bytes() == (tmp_path / "2" / name).read_bytes()
+
+
+def test_samples_of_a_data_set_without_truth(tmp_path: Path, frames: Path):
+    made = call("samples", "-o", tmp_path / "c", "--dataset", "frames", "--root", frames, "--size", "64x96")
+    assert made.exit_code == 0, made.output
+    images, truth = SampleCache(tmp_path / "c")[2]
+    np.testing.assert_array_equal(images[0], scenes.plane(np.random.default_rng(2), 70, 100)[0][3:67, 2:98])
+    assert np.isnan(truth).all()
+
+
+def test_starts_of_the_networks_go_on_and_grow(tmp_path: Path, frames: Path):
+    call("samples", "-o", tmp_path / "c", "--dataset", "frames", "--root", frames, "--size", "64x96")
+    disparity, motion = weights(tmp_path)
+    arguments = ("starts", "-o", tmp_path / "s", "--cache", tmp_path / "c", "--initial", "feedforward",
+                 "--disparity", disparity, "--motion", motion)  # fmt: skip
+    assert call(*arguments, "--count", 2).output.splitlines()[-1].endswith("2 starts")
+    first = np.array(StartCache(tmp_path / "s")[0][0])
+    assert call(*arguments).exit_code == 0
+    starts, cache = StartCache(tmp_path / "s"), SampleCache(tmp_path / "c")
+    assert starts.names == cache.names
+    np.testing.assert_array_equal(starts[0][0], first)
+    config = load_start_config("feedforward", disparity=disparity, motion=motion)
+    expected = make_start(to_frames(list(cache[2][0])), config)
+    np.testing.assert_array_equal(starts[2][0], expected.state())
+    np.testing.assert_array_equal(starts[2][1], expected.backward_flow.transpose(2, 0, 1))
+    np.testing.assert_array_equal(starts[2][2][1], expected.visible)
+    weights(tmp_path, seed=1)  # files of the same name, other weights
+    assert "made otherwise" in call(*arguments).stderr
+    assert not np.array_equal(make_start(to_frames(list(cache[2][0])), config).state(), expected.state())
+
+
+@pytest.mark.parametrize("initial", ["variational", "opencv"])
+def test_starts_of_other_methods(tmp_path: Path, frames: Path, initial: str):
+    call("samples", "-o", tmp_path / "c", "--dataset", "frames", "--root", frames, "--size", "64x96", "--count", 1)
+    made = call("starts", "-o", tmp_path / "s", "--cache", tmp_path / "c", "--initial", initial)
+    assert made.exit_code == 0, made.output
+    state, backward, evidence = StartCache(tmp_path / "s")[0]
+    assert np.abs(np.median(state[3:], (1, 2)) - scenes.FLOW).max() < 0.5
+    assert np.abs(np.median(backward, (1, 2)) + scenes.FLOW).max() < 0.5
+    assert 0 <= evidence.min() <= evidence.max() <= 1
+
+
+def test_refusals_are_one_line(tmp_path: Path, frames: Path, monkeypatch: pytest.MonkeyPatch):
+    made = ("samples", "-o", tmp_path / "c", "--family", "things", "--size", "32x48", "--count", 1)
+    assert call(*made).exit_code == 0
+    (tmp_path / "torn").mkdir()
+    (tmp_path / "torn" / "images.npy").write_bytes(b"\x93NUMPY")
+    full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    refused = {
+        "other samples": (*made, "--seed", 1),
+        "another size": (*made[:-1], 2),
+        "give either": made[:3],
+        "as 320x640": ("samples", "-o", tmp_path / "d", "--family", "things", "--size", "32"),
+        "unknown family": ("samples", "-o", tmp_path / "d", "--family", "clouds"),
+        "cannot be continued": ("samples", "-o", tmp_path / "torn", "--family", "things", "--size", "32x48"),
+        "does not fill": ("samples", "-o", tmp_path / "e", "--dataset", "frames", "--root", frames, "--size", "320x640"),
+        "is no cache of samples": ("starts", "-o", tmp_path / "s", "--cache", tmp_path, "--initial", "opencv"),
+        "no weights": ("starts", "-o", tmp_path / "s", "--cache", tmp_path / "c", "--initial", "feedforward",
+                       "--disparity", "nowhere.safetensors"),
+        "No space left": ("samples", "-o", tmp_path / "f", "--family", "things", "--size", "32x48"),
+    }  # fmt: skip
+    for text, arguments in refused.items():
+        if text == "No space left":
+            monkeypatch.setattr(os, "posix_fallocate", lambda *_: (_ for _ in ()).throw(full))
+        result = call(*arguments)
+        assert (result.exit_code, len(result.stderr.splitlines())) == (2, 1), result.output
+        assert text in result.stderr
+    assert list((tmp_path / "f").iterdir()) == []
