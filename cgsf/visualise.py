@@ -99,6 +99,48 @@ def overview(images: Sequence[np.ndarray], result: SceneFlow, truth: Truth | Non
     return _render(panels, result.shape, title)
 
 
+def comparison(state: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """Estimate, truth and error side by side, a row each for D1, the flow and the disparity change.
+
+    Parameters
+    ----------
+    state, truth : ndarray (5, H, W)
+        In pixels, NaN where unknown; maps that the state does not have at all are left out.
+
+    Returns
+    -------
+    ndarray (rows * H, 3 * W, 3) uint8
+        RGB. Errors have the classes of `ERROR_STEPS_PX`, black where the truth is unknown.
+    """
+    rows = []
+    for channels in ((0,), (3, 4), (2,)):
+        got, true = (np.stack([maps[channel] for channel in channels], -1).astype(np.float64) for maps in (state, truth))
+        if np.isfinite(got).any():
+            shown = true if np.isfinite(true).any() else got
+            error = np.hypot.reduce(np.abs(got - true), axis=-1) if len(channels) == 2 else np.abs(got - true)[..., 0]
+            rows.append(np.concatenate([_coloured(got, shown), _coloured(true, shown), error_colours(error)], 1))
+    return np.concatenate(rows)
+
+
+def error_colours(error: np.ndarray) -> np.ndarray:
+    """Errors (H, W) in pixels as RGB (H, W, 3) uint8 by the classes of `ERROR_STEPS_PX`; NaN is black."""
+    table = np.array([[int(colour[i : i + 2], 16) for i in (1, 3, 5)] for colour in _ERROR_COLOURS], np.uint8)
+    colours = table[np.searchsorted(ERROR_STEPS_PX, np.nan_to_num(error), "right")]
+    return np.where(np.isfinite(error)[..., None], colours, np.uint8(0))
+
+
+def _coloured(values: np.ndarray, reference: np.ndarray) -> np.ndarray:
+    """(H, W, 1 or 2) as RGB, with the range of `reference`."""
+    if values.shape[2] == 2:
+        return flow_colours(values, largest_length(reference))
+    from matplotlib import colormaps
+
+    low, high = np.nanpercentile(reference, [0.5, 99.5])
+    scaled = np.clip((values[..., 0] - low) / max(high - low, 1e-6), 0, 1)
+    colours = (255 * colormaps["turbo"](np.nan_to_num(scaled))[..., :3] + 0.5).astype(np.uint8)
+    return np.where(np.isfinite(values), colours, np.uint8(0))
+
+
 def _render(panels: Sequence[tuple[str, Callable[[Axes], None]]], shape: tuple[int, int], title: str) -> bytes:
     from matplotlib.figure import Figure
 

@@ -62,17 +62,28 @@ class FeedforwardModule(nn.Module):
         backward_flow : Tensor (B, 2, H, W)
             left2 -> left1.
         """
+        disparities, (motion, backward_flow) = self.disparities(left1, right1, left2, right2), self.motions(left1, left2)
+        return join_state(disparities, motion), backward_flow
+
+    def disparities(self, left1: Tensor, right1: Tensor, left2: Tensor, right2: Tensor) -> Tensor:
+        """D1 and D2 alone, (B, 2, H, W)."""
+        size = left1.shape[0], *left1.shape[2:]
         with self._mixed(left1.device):
             d1, d2 = self.disparity(left1, right1), self.disparity(left2, right2)
-            forward, backward = self._motions(left1, left2)
-        size = left1.shape[0], *left1.shape[2:]
-        if d1.shape != size or forward.shape != (size[0], 3, *size[1:]):
-            raise ValueError(f"networks must return disparity {size} and motion {(size[0], 3, *size[1:])}, "
-                             f"not {tuple(d1.shape)} and {tuple(forward.shape)}")
-        u, v, change = forward.unbind(1)
-        return torch.stack([d1, d2, change, u, v], 1), backward[:, :2]
+        if d1.shape != size or d2.shape != size:
+            raise ValueError(f"the network must return disparity {size}, not {tuple(d1.shape)}")
+        return torch.stack([d1, d2], 1)
 
-    def _motions(self, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
+    def motions(self, left1: Tensor, left2: Tensor) -> tuple[Tensor, Tensor]:
+        """Motion (B, 3, H, W: u, v and the disparity change) and backward flow (B, 2, H, W) alone."""
+        size = left1.shape[0], 3, *left1.shape[2:]
+        with self._mixed(left1.device):
+            forward, backward = self._both_ways(left1, left2)
+        if forward.shape != size:
+            raise ValueError(f"the network must return motion {size}, not {tuple(forward.shape)}")
+        return forward, backward[:, :2]
+
+    def _both_ways(self, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
         """Motion there and back; a network that can share work between the two is asked for both at once."""
         if isinstance(self.motion, SharedMotionNetwork):
             return self.motion.both_ways(first, second)
@@ -80,6 +91,11 @@ class FeedforwardModule(nn.Module):
 
     def _mixed(self, device: torch.device) -> AbstractContextManager[None]:
         return torch.autocast(device.type, torch.bfloat16, enabled=self.precision == "bfloat16")
+
+
+def join_state(disparities: Tensor, motion: Tensor) -> Tensor:
+    """The state (B, 5, H, W) of D1 and D2 (B, 2, H, W) and u, v, C (B, 3, H, W)."""
+    return torch.cat([disparities, motion[:, 2:], motion[:, :2]], 1)
 
 
 def fold_normalisation(net: nn.Module) -> nn.Module:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple, get_args
 
 import torch
 from torch import Tensor, nn
 
 from learned.batch import Batch
+from learned.feedforward import FeedforwardModule, join_state
 from learned.oracle import Oracle
 from learned.refiner import Refiner
 
@@ -74,34 +75,56 @@ def refine(
     return Refinement(states, reliabilities)
 
 
+NetworkName = Literal["disparity", "motion"]
+
+
 @dataclass(frozen=True)
 class HybridConfig:
     """How networks and refiner are joined."""
 
     steps: int | None = None
     """Refinement steps; None takes the refiner's own."""
+    cached: tuple[NetworkName, ...] = ()
+    """Networks that are not run: the batch's start holds what they say. For frozen ones."""
 
 
 class Hybrid(nn.Module):
-    """X_0 = H(images), then T steps of G; trained jointly, or with H frozen.
+    """X_0 = H(images), then T steps of G; trained jointly, or with a part frozen.
 
     Parameters
     ----------
     feedforward : nn.Module
-        H: ``(left1, right1, left2, right2) -> (state (B, 5, H, W), backward flow (B, 2, H, W))``.
+        H: ``(left1, right1, left2, right2) -> (state (B, 5, H, W), backward flow (B, 2, H, W))``; with one network
+        cached, a `learned.feedforward.FeedforwardModule`.
     refiner : Refiner
         G.
+    config : HybridConfig
     """
 
     def __init__(self, feedforward: nn.Module, refiner: Refiner, config: HybridConfig = HybridConfig()) -> None:
         super().__init__()
         self.feedforward, self.refiner, self.config = feedforward, refiner, config
 
-    def forward(self, batch: Batch, watch: Watch | None = None) -> Refinement:
+    def forward(self, batch: Batch, oracle: Oracle | None = None, watch: Watch | None = None) -> Refinement:
         """The refinement of the networks' state."""
-        return refine(self.refiner, self.start(batch), steps=self.config.steps, watch=watch)
+        return refine(self.refiner, self.start(batch), oracle, self.config.steps, watch)
 
     def start(self, batch: Batch) -> Batch:
-        """The batch with the networks' state as its start."""
-        state, backward = self.feedforward(*batch.frames)
-        return Batch(batch.images, batch.truth, state, backward.detach(), batch.evidence, batch.names)
+        """The batch with the networks' state as its start; the backward flow is held fixed."""
+        cached = self.config.cached
+        if cached and (batch.start is None or batch.backward_flow is None):
+            raise ValueError("networks that are not run need a batch with starts")
+        if not cached:
+            state, backward = self.feedforward(*batch.frames)
+        elif len(set(cached)) == len(get_args(NetworkName)):
+            return batch
+        elif "motion" in cached:
+            assert isinstance(self.feedforward, FeedforwardModule)
+            state = torch.cat([self.feedforward.disparities(*batch.frames), batch.start[:, 2:]], 1)  # type: ignore[index]
+            backward = batch.backward_flow
+        else:
+            assert isinstance(self.feedforward, FeedforwardModule)
+            left1, _, left2, _ = batch.frames
+            motion, backward = self.feedforward.motions(left1, left2)
+            state = join_state(batch.start[:, :2], motion)  # type: ignore[index]
+        return replace(batch, start=state.float(), backward_flow=backward.float().detach())

@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import torch
 import torch.distributed as dist
 from torch import Tensor, nn
@@ -35,6 +36,8 @@ BatchAt = Callable[[int], Batch]
 Loss = Callable[[nn.Module, Batch], tuple[Tensor, dict[str, float]]]
 #: Scores of a model on held-out samples; "score" decides which checkpoint is the best (smaller is better).
 Validate = Callable[[nn.Module], dict[str, float]]
+#: Pictures by name, (H, W, 3) uint8 RGB, of what a model makes of held-out samples.
+Show = Callable[[nn.Module], dict[str, np.ndarray]]
 
 
 class TrainingError(RuntimeError):
@@ -62,7 +65,8 @@ class TrainingConfig:
     precision: Literal["float32", "bfloat16"] = "bfloat16"
     """bfloat16: mixed precision, about twice as fast in large convolutions."""
     frozen: tuple[str, ...] = ()
-    """Parameters whose names begin with one of these keep their values."""
+    """Parameters whose names begin with one of these keep their values, and so do the statistics of normalisation in
+    modules so named."""
     seed: int = 0
     """Of everything that is drawn."""
     checkpoint_every: int = 200
@@ -72,7 +76,7 @@ class TrainingConfig:
     validate_every: int = 500
     """Steps between validations."""
     tensorboard: bool = False
-    """Write TensorBoard files too (the package ``tensorboard`` is needed)."""
+    """Write TensorBoard files too, with pictures at every validation (the package ``tensorboard`` is needed)."""
 
     def __post_init__(self) -> None:
         if min(self.steps, self.checkpoint_every, self.log_every, self.validate_every) < 1:
@@ -110,6 +114,7 @@ def fit(
     validate: Validate | None = None,
     seconds: float = math.inf,
     progress: bool = False,
+    show: Show | None = None,
 ) -> dict[str, float]:
     """Train a model in place; a folder with a checkpoint is continued.
 
@@ -131,6 +136,8 @@ def fit(
         Stop (with a checkpoint, to be continued) when this time is over.
     progress : bool
         Show a bar with the time left.
+    show : callable, optional
+        Pictures for TensorBoard, made at every validation under the same conditions.
 
     Returns
     -------
@@ -148,7 +155,7 @@ def fit(
     folder.mkdir(parents=True, exist_ok=True)
     device = next(model.parameters()).device
     for name, parameter in model.named_parameters():
-        parameter.requires_grad_(not name.startswith(config.frozen) if config.frozen else True)
+        parameter.requires_grad_(not name.startswith(config.frozen))
     run = _Run(model, config, folder)
     step = run.resume(device)
     objective = _Objective(model, loss)
@@ -160,7 +167,7 @@ def fit(
     numbers: dict[str, float] = {}
     writer = _tensorboard(folder) if config.tensorboard and rank == 0 else None
     bar = tqdm(total=config.steps, initial=step, disable=not progress or rank > 0, dynamic_ncols=True)
-    model.train()
+    _train_mode(model, config.frozen)
     for batch in _ahead(batch_at, range(step * world + rank, config.steps * world, world)):
         torch.manual_seed(config.seed * 1_000_003 + step)
         for group in run.optimizer.param_groups:
@@ -187,6 +194,9 @@ def fit(
             }
             if validate and (step % config.validate_every == 0 or step == config.steps):
                 numbers |= _validated(model, validate, run, step)
+                if show and writer:
+                    _write_pictures(writer, model, show, step)
+                _train_mode(model, config.frozen)
             if step % config.log_every == 0 or last or "score" in numbers:
                 _log(folder / "log.jsonl", numbers, writer)
                 bar.set_postfix(loss=f"{numbers['loss']:.3g}")
@@ -280,11 +290,18 @@ def _blame(objective: nn.Module, batch: Batch, value: float, step: int) -> str:
     return f"loss {value} or its gradient is not finite at step {step}; samples {', '.join(names)} are finite one by one"
 
 
+def _train_mode(model: nn.Module, frozen: tuple[str, ...]) -> None:
+    """Training mode for all but frozen modules, whose normalisation would drift otherwise."""
+    model.train()
+    for name, module in model.named_modules():
+        if f"{name}.".startswith(frozen):
+            module.eval()
+
+
 def _validated(model: nn.Module, validate: Validate, run: _Run, step: int) -> dict[str, float]:
     model.eval()
     with torch.no_grad():
         scores = validate(model)
-    model.train()
     if scores["score"] < run.best:
         run.best = scores["score"]
         save_atomically({"step": step, "model": model.state_dict()}, run.folder / "best.pt")
@@ -297,6 +314,13 @@ def _log(path: Path, numbers: dict[str, float], writer: Any) -> None:
     if writer:
         for key, value in numbers.items():
             writer.add_scalar(key, value, int(numbers["step"]))
+
+
+def _write_pictures(writer: Any, model: nn.Module, show: Show, step: int) -> None:
+    model.eval()
+    with torch.no_grad():
+        for name, picture in show(model).items():
+            writer.add_image(name, picture, step, dataformats="HWC")
 
 
 def _tensorboard(folder: Path) -> Any:

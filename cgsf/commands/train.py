@@ -10,8 +10,8 @@ import click
 @click.option("--starts", metavar="FOLDER", help="States to refine, in place of the recipe's.")
 @click.option("--steps", type=click.IntRange(1), help="Length of the run, in place of the recipe's.")
 @click.option("--minutes", type=click.FloatRange(0), help="Stop after this time, to be continued.")
-@click.option("--threads", type=click.IntRange(1), help="CPU threads.")
-@click.option("--export", metavar="FILE", help="Write the best weights to this .safetensors file at the end.")
+@click.option("--threads", type=click.IntRange(1), help="CPU threads of a process.")
+@click.option("--export", metavar="FILE", help="Write the best weights to this .safetensors file (a joint run: three).")
 def command(
     recipe: str, output: str, cache: str | None, starts: str | None, steps: int | None, minutes: float | None,
     threads: int | None, export: str | None,
@@ -20,7 +20,8 @@ def command(
 
     Several processes share the work under torchrun: torchrun --nproc-per-node 2 -m cgsf.cli train RECIPE ...
     """
-    from cgsf.training import export_best, read_recipe, run_recipe, with_changes
+    from cgsf.recipe import read_recipe, with_changes
+    from cgsf.training import export_best, run_recipe
 
     settings = with_changes(read_recipe(recipe), cache, starts, steps)
     numbers = run_recipe(settings, output, seconds=60 * minutes if minutes else float("inf"), threads=threads)

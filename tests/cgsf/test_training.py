@@ -2,6 +2,9 @@
 
 import dataclasses
 import json
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,21 +12,26 @@ import torch
 
 import cgsf
 from cgsf import pipelines
+from cgsf.datasets.frames import FrameFolders
 from cgsf.datasets.sample import Sample, Truth
 from cgsf.errors import InputError
-from cgsf.refined import RefinedConfig, run_refined
+from cgsf.recipe import Recipe, read_recipe, with_changes
+from cgsf.refined import RefinedConfig, load_refiner, run_refined
 from cgsf.sample_cache import SampleCache, write_cache
+from cgsf.stages import STAGES
 from cgsf.start_cache import StartCache, write_starts
-from cgsf.starts import StartConfig
-from cgsf.training import Recipe, export_best, read_recipe, train, with_changes
+from cgsf.starts import StartConfig, load_start_config
+from cgsf.training import export_best, train
 from learned.augment import AugmentConfig
-from learned.checkpoint import ModelCard, save
+from learned.checkpoint import ModelCard, load, save
 from learned.pwcnet import PWCNet, PWCNetConfig
 from learned.refiner import COMPACT, Refiner
 from learned.training import TrainingConfig
 from tests.cgsf import scenes
-from tests.cgsf.test_caches import SMALL_GANET, SMALL_PWCNET
+from tests.cgsf.test_caches import SMALL_GANET, SMALL_PWCNET, weights
+from variational.energy import EnergyConfig
 
+ROOT = Path(__file__).parents[2]
 SIZE = (64, 96)
 NAMES = [f"plane-{i}" for i in range(4)]
 SMALL_REFINER = dataclasses.replace(COMPACT, layers=((8, 1),), propagation=(1,), steps=2)
@@ -103,10 +111,102 @@ def test_every_stage_trains_and_exports(folder, tmp_path, stage):
     assert "2 steps" in (tmp_path / "net.safetensors.md").read_text()
 
 
+def joint(folder, frozen=(), **changes) -> Recipe:
+    """A joint recipe that begins with small networks."""
+    disparity, motion = weights(folder)
+    training = TrainingConfig(steps=2, log_every=1, validate_every=2, frozen=frozen, precision="float32")
+    return recipe(folder, "joint", **({"starts": ""} | changes), disparity=disparity, motion=motion, training=training)
+
+
+def test_joint_training_moves_all_parts_and_exports_them(folder, tmp_path):
+    settings = joint(folder)
+    numbers = train(settings, tmp_path / "run")
+    assert {"SF-0", "SF-1", "SF-2", "energy-0", "start", "end"} <= set(numbers)
+    export_best(settings, tmp_path / "run", tmp_path / "net.safetensors")
+    before = STAGES["joint"].network(settings)
+    for suffix, part in (("disparity", before.feedforward.disparity), ("flow", before.feedforward.motion)):
+        trained = load(tmp_path / f"net-{suffix}.safetensors")[0].state_dict()
+        assert any(not torch.equal(trained[name], value) for name, value in part.state_dict().items())
+    assert load_refiner(str(tmp_path / "net-refiner.safetensors")).correction.weight.abs().max() > 0
+
+
+@pytest.mark.parametrize("frozen", ["disparity", "motion", ""])
+def test_frozen_networks_are_read_from_the_starts(folder, tmp_path, frozen):
+    """Their cached states lead to the same training, and their weights and statistics stay."""
+    part = "feedforward." + frozen
+    plain = joint(folder, (part,), augment=AugmentConfig(*SIZE, 0, 0, False, 0, 0, 0, 0))
+    config = load_start_config("feedforward", disparity=plain.disparity, motion=plain.motion)
+    write_starts(tmp_path / "starts", SampleCache(folder / "cache"), config)
+    cached = dataclasses.replace(plain, starts=str(tmp_path / "starts"))
+    assert cached.cached_networks == ((frozen,) if frozen else ("disparity", "motion"))
+    ran, read = (train(settings, tmp_path / name) for settings, name in ((plain, "ran"), (cached, "read")))
+    assert read["loss"] == pytest.approx(ran["loss"], rel=1e-4)
+    before = STAGES["joint"].network(plain).state_dict()
+    after = torch.load(tmp_path / "ran" / "best.pt", weights_only=True)["model"]
+    assert {name for name in before if name.startswith(part)} <= {n for n in before if torch.equal(before[n], after[n])}
+    assert not torch.equal(before["refiner.correction.bias"], after["refiner.correction.bias"])
+
+
 def test_supervision_without_truth(folder, tmp_path):
     first = train(recipe(folder, "refiner", supervision="energy"), tmp_path / "energy")
     second = train(recipe(folder, "refiner", supervision="both"), tmp_path / "both")
     assert second["loss"] > first["loss"] > 0
+
+
+@pytest.mark.parametrize("stage", ["refiner", "joint"])
+def test_frames_without_truth_train_by_the_energy(folder, tmp_path, stage):
+    """From a folder of frames to a lower energy of the frame that is held out."""
+    frames = tmp_path / "frames"
+    for index in range(2):
+        scenes.write_images(frames / f"scene_{index}", scenes.plane(np.random.default_rng(index), 70, 100))
+    source = FrameFolders(frames)
+    cache = write_cache(tmp_path / "cache", source.names, source.__getitem__, SIZE)
+    write_starts(tmp_path / "starts", cache, StartConfig("opencv"))
+    settings = joint(folder, cache=str(tmp_path / "cache"), batch=1, supervision="energy")
+    training = TrainingConfig(steps=12, learning_rate=2e-3, warmup=0, log_every=1, validate_every=4, precision="float32")
+    starts = "" if stage == "joint" else str(tmp_path / "starts")
+    settings = dataclasses.replace(settings, stage=stage, starts=starts, training=training)
+    settings = dataclasses.replace(settings, augment=AugmentConfig(48, 64, colour=0, noise=0, erase=0))
+    train(settings, tmp_path / "run")
+    lines = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
+    scores = [line for line in lines if "score" in line]
+    assert "SF" not in scores[0]
+    assert scores[-1]["score"] == scores[-1]["energy-2"] < scores[0]["energy-2"]
+    with pytest.raises(InputError, match="no truth to learn from"):
+        train(dataclasses.replace(settings, supervision="both"), tmp_path / "other")
+
+
+def test_pictures_for_tensorboard(folder, tmp_path):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    settings = recipe(folder, "refiner")
+    train(dataclasses.replace(settings, training=dataclasses.replace(settings.training, tensorboard=True)), tmp_path)
+    log = EventAccumulator(str(tmp_path)).Reload()
+    (picture,) = log.Images("held out")
+    assert (picture.step, picture.width, picture.height) == (2, 3 * SIZE[1], 3 * SIZE[0])
+    assert {"loss", "SF-0"} <= set(log.Tags()["scalars"])
+
+
+def test_threads_bound_every_library(tmp_path):
+    """In a process of its own: torch rounds differently once its pool has been set."""
+    program = f"""
+import cv2, numba, torch
+from click.testing import CliRunner
+from cgsf.cli import main
+refused = CliRunner().invoke(main, ["train", "flow", "-o", {str(tmp_path)!r}, "--cache", "nowhere", "--threads", "1"])
+print(refused.exit_code, numba.get_num_threads(), torch.get_num_threads(), cv2.getNumThreads())
+"""
+    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["2", "1", "1", "1"]
+
+
+def test_a_run_of_before_a_new_setting_goes_on(folder, tmp_path):
+    settings = recipe(folder, "refiner")
+    train(settings, tmp_path)
+    record = json.loads((tmp_path / "run.json").read_text())
+    del record["recipe"]["energy"]
+    (tmp_path / "run.json").write_text(json.dumps(record))
+    assert train(with_changes(settings, steps=3), tmp_path)["step"] == 3
 
 
 def test_another_recipe_does_not_continue_a_run(folder, tmp_path):
@@ -151,12 +251,16 @@ def test_bad_input_is_one_clear_line(folder, tmp_path):
     save(PWCNet(PWCNetConfig(pyramid=(4, 4, 8))), tmp_path / "flow.safetensors", ModelCard("a test"))
     foreign = {"refiner": str(tmp_path / "flow.safetensors")}
     config = pipelines.with_settings(pipelines.load_config("variational+refiner"), foreign)
+    energy_run = tmp_path / "energy"
+    train(recipe(folder, "refiner", energy=EnergyConfig(0)), energy_run)
     refused = {
         "no recipe": lambda: read_recipe("nothing"),
         "no valid TOML": lambda: read_recipe(tmp_path / "bad.toml"),
         "is no cache": lambda: train(recipe(folder, "flow", cache=str(tmp_path)), tmp_path / "run"),
         "is no cache of starts": lambda: train(recipe(folder, "refiner", starts=str(tmp_path)), tmp_path / "other"),
         "held out": lambda: train(recipe(folder, "flow", held_out=4), tmp_path / "third"),
+        "that are frozen": lambda: train(joint(folder, starts=str(folder / "starts")), tmp_path / "fourth"),
+        "for ablations": lambda: export_best(recipe(folder, "refiner", energy=EnergyConfig(0)), energy_run, "x.safetensors"),
         "not of a refiner": lambda: pipelines.solve(make(0).images, "variational+refiner", config),
         "no weights": lambda: export_best(recipe(folder, "flow"), tmp_path, tmp_path / "x.safetensors"),
         "no setting": lambda: pipelines.with_settings(pipelines.load_config("variational"), {"strategy": "learned"}),

@@ -152,7 +152,7 @@ def test_feedforward_takes_any_networks_and_orders_the_state():
 
 def test_feedforward_refuses_networks_that_break_the_protocol():
     images = _images(5, 7)
-    with pytest.raises(ValueError, match="must return disparity"):
+    with pytest.raises(ValueError, match="must return motion"):
         FeedforwardModule(_brightness, lambda a, b: a[:, :2] - b[:, :2])(*images)
 
 

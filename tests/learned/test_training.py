@@ -54,7 +54,8 @@ def test_a_killed_run_resumes_exactly(tmp_path: Path):
     whole, resumed = make_model(), make_model()
     fit(whole, batch_at, loss, CONFIG, tmp_path / "whole")
     code = f"from tests.learned.test_training import train_and_die; train_and_die({str(tmp_path / 'killed')!r}, 9)"
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
+    threads = os.environ | {"OMP_NUM_THREADS": str(torch.get_num_threads())}  # another number rounds otherwise
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, env=threads, capture_output=True, text=True, check=False)
     assert done.returncode == -signal.SIGKILL, done.stderr
     at = torch.load(tmp_path / "killed" / "checkpoint.pt", weights_only=True)["step"]
     assert 0 < at < CONFIG.steps
@@ -102,6 +103,15 @@ def test_frozen_parts_stay(tmp_path: Path):
     fit(model, batch_at, loss, dataclasses.replace(CONFIG, frozen=("0.",)), tmp_path)
     assert torch.equal(model[0].weight, make_model()[0].weight)
     assert not torch.equal(model[2].weight, make_model()[2].weight)
+
+
+def test_frozen_normalisation_keeps_its_statistics(tmp_path: Path):
+    layers = torch.nn.Conv2d(3, 4, 1), torch.nn.BatchNorm2d(4), torch.nn.BatchNorm2d(4), torch.nn.Conv2d(4, 1, 1)
+    model = torch.nn.Sequential(*layers)
+    config = dataclasses.replace(CONFIG, frozen=("0.", "1."))
+    fit(model, batch_at, loss, config, tmp_path, lambda model: {"score": 0.0})
+    assert torch.equal(model[1].running_var, torch.ones(4))
+    assert not torch.equal(model[2].running_var, torch.ones(4))
 
 
 def test_not_a_number_stops_with_the_samples_name(tmp_path: Path):
