@@ -17,6 +17,7 @@ from cgsf.errors import InputError
 COMMANDS = {
     "run": ("run", "Scene flow of four images."),
     "evaluate": ("evaluate", "Score methods on a data set."),
+    "strategies": ("strategies", "Learned refinement beside gradient descent on outputs and on parameters."),
     "report": ("report", "One table over several data sets, beside OpenCV's compositions."),
     "cache": ("cache", "Samples and starts on disk, for training."),
     "train": ("train", "Train a network or a refiner by a recipe."),

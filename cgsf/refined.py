@@ -9,16 +9,19 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from cgsf.errors import InputError
-from cgsf.feedforward import load_network
+from cgsf.feedforward import FeedforwardConfig, load_network
 from cgsf.scene_flow import SceneFlow
 from cgsf.starts import StartConfig, make_start, to_batch
+from cgsf.steps_picture import StepsRecorder, write_steps_picture
 from variational.camera import StereoCamera
 from variational.frames import Frames
 from variational.terms.visibility import visible_mask
 
 if TYPE_CHECKING:
-    from torch import nn
+    from torch import Tensor, nn
 
+    from learned.feedforward import FeedforwardModule
+    from learned.hybrid import Watch
     from learned.refiner import Refiner
 
 
@@ -44,6 +47,10 @@ class RefinedConfig(StartConfig):
     refiner : str
         The name of weights that ship (``learned/weights/NAME.safetensors``) or the path of a file; empty takes
         the one that ships for this start.
+    outputs_rate : float
+        Adam's step on the state in pixels, for outputs.
+    parameters_rate : float
+        Adam's step on the weights, for parameters; larger ones unlearn what training has taught.
     steps_picture : str
         Write a picture of every step's energy, gradient and update to this .png file; empty for none.
     """
@@ -51,11 +58,13 @@ class RefinedConfig(StartConfig):
     strategy: Literal["learned", "outputs", "parameters"] = "learned"
     steps: int = 0
     refiner: str = ""
+    outputs_rate: float = 0.02
+    parameters_rate: float = 1e-5
     steps_picture: str = ""
 
     def __post_init__(self) -> None:
-        if self.steps < 0:
-            raise ValueError("steps must not be negative")
+        if self.steps < 0 or not (self.outputs_rate > 0 and self.parameters_rate > 0):
+            raise ValueError("steps must not be negative, rates must be positive")
         if self.steps_picture and self.strategy == "parameters":
             raise ValueError('strategy "parameters" has no picture of its steps')
         if self.strategy == "parameters" and self.initial != "feedforward":
@@ -63,49 +72,81 @@ class RefinedConfig(StartConfig):
 
 
 def run_refined(frames: Frames, config: RefinedConfig, camera: StereoCamera | None = None, progress: Any = None) -> SceneFlow:
-    """Scene flow by a start and a refinement strategy; masks and confidence are the start's, but for what moved."""
-    from learned.strategies import StrategyConfig, apply_strategy
-
-    refiner = load_refiner(config.refiner or SHIPPED_REFINERS[config.initial]) if config.strategy == "learned" else None
+    """Scene flow by a start and a refinement strategy."""
+    strategy = Strategist(config)
     begin = time.perf_counter()
     start = make_start(frames, config, camera, progress)
-    seconds = {**start.seconds, "initial state": time.perf_counter() - begin}
+    start = replace(start, seconds={**start.seconds, "initial state": time.perf_counter() - begin})
     if progress:
         progress("refinement", 0.95)
-    steps: list[dict[str, np.ndarray]] = []
+    recorder = StepsRecorder(strategy.steps) if config.steps_picture else None
+    result = strategy(frames, start, recorder)
+    if recorder:
+        write_steps_picture(config.steps_picture, recorder.kept)
+    return result
 
-    def watch(step: int, state: Any, loss: Any, gradient: Any) -> None:
-        maps = {"state": state, "loss": loss, "gradient": gradient}
-        steps.append({name: value[0].float().cpu().numpy().copy() for name, value in maps.items()})
 
-    networks = None
-    if config.strategy == "parameters":
-        from learned.feedforward import FeedforwardModule
+class Strategist:
+    """A refinement strategy whose refiner or networks are loaded, ready for any number of frames.
 
-        disparity, motion = (load_network(name) for name in (config.feedforward.disparity, config.feedforward.motion))
-        networks = FeedforwardModule(disparity, motion, config.feedforward.precision).to(config.device)
-    batch = to_batch(frames, start).to(config.device)
-    strategy = StrategyConfig(config.strategy, config.steps)
-    watched = watch if config.steps_picture else None
-    refined = apply_strategy(strategy, batch, None if refiner is None else refiner.to(config.device), networks, watch=watched)
-    state = refined.state[0].float().cpu().numpy()
-    if config.steps_picture:
-        from cgsf.steps_picture import write_steps_picture
+    Parameters
+    ----------
+    config : RefinedConfig
 
-        write_steps_picture(config.steps_picture, steps)
-    backward = start.backward_flow
-    visible = (
-        start.visible
-        if backward is None
-        else start.visible & visible_mask(np.ascontiguousarray(state[3:].transpose(1, 2, 0)), backward, 0.01, 0.5)
-    )
-    seconds["refinement"] = refined.seconds
-    record = {**start.record, "strategy": config.strategy, "steps": strategy.count(refiner)}
-    return SceneFlow.from_state(
-        state, visible, confidence=start.confidence, moving=start.moving, camera_motion=start.camera_motion,
-        backward_flow=backward, seconds=seconds, record=record,
-        initial=replace(start, method=f"{config.initial} start"),
-    )  # fmt: skip
+    Raises
+    ------
+    InputError
+        If there are no such weights.
+    """
+
+    def __init__(self, config: RefinedConfig) -> None:
+        from learned.strategies import StrategyConfig
+
+        self.config = config
+        self.refiner = self.networks = None
+        if config.strategy == "learned":
+            self.refiner = load_refiner(config.refiner or SHIPPED_REFINERS[config.initial]).to(config.device)
+        elif config.strategy == "parameters":
+            self.networks = load_networks(config.feedforward).to(config.device)
+        self.strategy = StrategyConfig(config.strategy, config.steps, config.outputs_rate, config.parameters_rate)
+        self.steps = self.strategy.count(self.refiner)
+
+    def __call__(self, frames: Frames, start: SceneFlow, watch: Watch | None = None) -> SceneFlow:
+        """The refined start. Masks and confidence are the start's, but for what has moved out of sight."""
+        from learned.strategies import apply_strategy
+
+        batch = to_batch(frames, start).to(self.config.device)
+        refined = apply_strategy(self.strategy, batch, self.refiner, self.networks, watch=watch)
+        return self.result(start, refined.state, refined.seconds)
+
+    def adapt(self, frames: Frames, start: SceneFlow) -> SceneFlow:
+        """As a call, for the next frame of a video: the networks stay adapted (strategy parameters only)."""
+        from learned.strategies import adapt_frame
+
+        assert self.networks is not None
+        begin = time.perf_counter()
+        state = adapt_frame(self.strategy, to_batch(frames, start).to(self.config.device), self.networks)
+        return self.result(start, state, time.perf_counter() - begin)
+
+    def result(self, start: SceneFlow, state: Tensor, seconds: float) -> SceneFlow:
+        """The scene flow of a state (1, 5, H, W) that was made of a start."""
+        maps = state[0].float().cpu().numpy()
+        assert start.backward_flow is not None
+        flow = np.ascontiguousarray(maps[3:].transpose(1, 2, 0))
+        return SceneFlow.from_state(
+            maps, start.visible & visible_mask(flow, start.backward_flow, 0.01, 0.5), confidence=start.confidence,
+            moving=start.moving, camera_motion=start.camera_motion, backward_flow=start.backward_flow,
+            seconds={**start.seconds, "refinement": seconds},
+            record={**start.record, "strategy": self.config.strategy, "steps": self.steps},
+            initial=replace(start, method=f"{self.config.initial} start"),
+        )  # fmt: skip
+
+
+def load_networks(config: FeedforwardConfig) -> FeedforwardModule:
+    """Both networks, whose weights may be trained."""
+    from learned.feedforward import FeedforwardModule
+
+    return FeedforwardModule(load_network(config.disparity), load_network(config.motion), config.precision).eval()
 
 
 def load_refiner(name: str) -> Refiner:

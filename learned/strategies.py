@@ -92,7 +92,7 @@ def apply_strategy(
     make_oracle : callable
         The energy; the paper's unless given.
     watch : callable or None
-        Sees step, state, energy map and gradient; for learned and outputs.
+        Sees step, state, energy map and gradient, of the last state too; for learned and outputs.
     """
     if batch.start is None:
         raise ValueError("there is no start to refine")
@@ -122,6 +122,8 @@ def descend_outputs(start: Tensor, oracle: Oracle, steps: int, rate: float, watc
         if watch:
             watch(step, state, loss, state.grad)
         optimizer.step()
+    if watch:
+        watch(steps, state, *oracle.features(state))
     return state
 
 
@@ -173,11 +175,19 @@ def adapt_video(
     Tensor (B, 5, H, W)
         Each frame's state, in pixels, with the weights adapted to all frames so far.
     """
-    if config.strategy != "parameters":
-        raise ValueError("only the strategy parameters carries anything from frame to frame")
     with restored(networks):
         for batch in batches:
-            with torch.inference_mode():
-                _, backward = networks(*batch.frames)
-            batch = replace(batch, backward_flow=backward.float())
-            yield descend_parameters(networks, batch, make_oracle(batch), config.count(None), config.parameters_rate)
+            yield adapt_frame(config, batch, networks, make_oracle)
+
+
+def adapt_frame(
+    config: StrategyConfig, batch: Batch, networks: nn.Module, make_oracle: MakeOracle = _paper_energy
+) -> Tensor:
+    """One frame of `adapt_video`: its state, (B, 5, H, W) in pixels; the networks stay adapted to it."""
+    if config.strategy != "parameters":
+        raise ValueError("only the strategy parameters carries anything from frame to frame")
+    networks.eval()
+    with torch.inference_mode():
+        _, backward = networks(*batch.frames)
+    batch = replace(batch, backward_flow=backward.float().clone())
+    return descend_parameters(networks, batch, make_oracle(batch), config.count(None), config.parameters_rate)

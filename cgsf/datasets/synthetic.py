@@ -11,7 +11,7 @@ from typing import Any
 
 from cgsf.datasets.sample import Sample
 from cgsf.errors import InputError
-from cgsf.synthetic import make_sample
+from cgsf.synthetic import make_sample, make_video
 
 
 class Synthetic:
@@ -23,11 +23,13 @@ class Synthetic:
         Not used.
     family : str
     count : int
-        Number of samples.
+        Number of scenes.
     seed : int
-        Seed of the first sample; the others follow.
+        Seed of the first scene; the others follow.
     height, width : int
         Image size in pixels.
+    frames : int
+        Length of each scene's video; it gives one sample less, of two frames that follow each other.
     **options
         Fields of `RenderConfig`.
     """
@@ -40,18 +42,27 @@ class Synthetic:
         seed: int = 0,
         height: int = 376,
         width: int = 1242,
+        frames: int = 2,
         **options: Any,
     ) -> None:
-        if count < 1:
-            raise InputError(f"count must be at least 1, got {count}")
+        if count < 1 or frames < 2:
+            raise InputError(f"count must be at least 1 and frames at least 2, got {count} and {frames}")
         self.family, self.seeds, self.size, self.options = family, range(seed, seed + count), (height, width), options
-        self.names = [f"{family}-{number:06d}" for number in self.seeds]
+        self.frames = frames
+        scenes = [f"{family}-{number:06d}" for number in self.seeds]
+        self.names = scenes if frames == 2 else [f"{name}/{frame:03d}" for name in scenes for frame in range(frames - 1)]
+        self._video: tuple[int, list[Sample]] | None = None
 
     def __len__(self) -> int:
         return len(self.names)
 
     def __getitem__(self, index: int) -> Sample:
-        return make_sample(self.family, self.seeds[index], *self.size, **self.options)
+        scene, frame = divmod(range(len(self))[index], self.frames - 1)
+        if self.frames == 2:
+            return make_sample(self.family, self.seeds[scene], *self.size, **self.options)
+        if self._video is None or self._video[0] != scene:  # a video is rendered as a whole
+            self._video = scene, make_video(self.family, self.seeds[scene], *self.size, self.frames, **self.options)
+        return self._video[1][frame]
 
 
 class Street(Synthetic):
