@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from variational.census import BITS, popcount
-from variational.jit import parallel, prange, rowwise
+from variational.jit import inlined, parallel, prange, rowwise
 
 STRIP = 192
 """Columns that a chain works on at a time: their candidates and costs of two rows stay in the nearest cache, and what
@@ -83,16 +83,16 @@ def _costs(
                 costs[k, y, x] = cost
 
 
-@rowwise
+@inlined
 def _least_of_two(
-    change: np.ndarray, u: np.ndarray, v: np.ndarray, change_from: np.ndarray, u_from: np.ndarray, v_from: np.ndarray,
-    price: np.ndarray, before: np.ndarray, message: np.ndarray,
-) -> None:  # fmt: skip
-    """message (X,) <- its minimum with the costs before plus those of the step; flat arguments, to be vectorised."""
-    for x in range(message.size):
-        difference = abs(change[x] - change_from[x]) + abs(u[x] - u_from[x]) + abs(v[x] - v_from[x])
-        cost = before[x] + price[x] * difference
-        message[x] = cost if cost < message[x] else message[x]  # NaN: no such candidate, full price
+    motion: np.ndarray, k: int, motion_from: np.ndarray, m: int, price: np.ndarray, before: np.ndarray, message: np.ndarray
+) -> None:
+    """message[k] <- its minimum with the costs of label m before plus those of the step from m to k."""
+    for x in range(price.size):
+        difference = abs(motion[k, 0, x] - motion_from[m, 0, x]) + abs(motion[k, 1, x] - motion_from[m, 1, x])
+        difference += abs(motion[k, 2, x] - motion_from[m, 2, x])
+        cost = before[m, x] + price[x] * difference
+        message[k, x] = cost if cost < message[k, x] else message[k, x]  # NaN: no such candidate, full price
 
 
 @rowwise
@@ -110,12 +110,10 @@ def _pass_message(
         for x in range(width):
             least[x] = min(least[x], before[k, x])
     for k in range(count):
-        now = motion[k]
         for x in range(width):
             message[k, x] = least[x] + price[x]
         for m in range(count):
-            last = motion_from[m]
-            _least_of_two(now[0], now[1], now[2], last[0], last[1], last[2], price_per_px, before[m], message[k])
+            _least_of_two(motion, k, motion_from, m, price_per_px, before, message)
         for x in range(width):
             message[k, x] -= least[x]
 
@@ -177,8 +175,23 @@ def _chains(
 
 def _transposed(planes: np.ndarray) -> np.ndarray:
     """(..., W, H) copy of (..., H, W) planes."""
-    turned = [cv2.transpose(plane) for plane in planes.reshape(-1, *planes.shape[-2:])]
-    return np.stack(turned).reshape(*planes.shape[:-2], *turned[0].shape)
+    height, width = planes.shape[-2:]
+    turned = np.empty((*planes.shape[:-2], width, height), planes.dtype)
+    for plane, out in zip(planes.reshape(-1, height, width), turned.reshape(-1, width, height), strict=True):
+        cv2.transpose(plane, dst=out)
+    return turned
+
+
+@parallel
+def _cheapest(costs: np.ndarray, labels: np.ndarray) -> None:
+    """labels (H, W): the first label of least cost."""
+    count, height, width = costs.shape
+    for y in prange(height):
+        for x in range(width):
+            best = np.int32(0)
+            for k in range(1, count):
+                best = np.int32(k) if costs[k, y, x] < costs[best, y, x] else best
+            labels[y, x] = best
 
 
 def _price(disparity: np.ndarray, grey: np.ndarray, axis: int, config: FusionConfig) -> np.ndarray:
@@ -240,4 +253,6 @@ def choose(
     rows, trees = np.empty_like(turned), np.empty_like(costs)
     _chains(_transposed(candidates), turned, cv2.transpose(_price(disparity, grey, 1, config)), inverse_scale, rows)
     _chains(candidates, _transposed(rows), _price(disparity, grey, 0, config), inverse_scale, trees)
-    return trees.argmin(axis=0)
+    labels = np.empty(grey.shape, np.int32)
+    _cheapest(trees, labels)
+    return labels

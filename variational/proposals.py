@@ -102,6 +102,21 @@ def _insert(distance: np.ndarray, reach: float, index: int, nearest: np.ndarray,
             nearest[slot, y, x], labels[slot, y, x] = distance[y, x], index
 
 
+@parallel
+def _take(
+    chosen: np.ndarray, candidates: np.ndarray, labels_of: np.ndarray, costs: np.ndarray, motion: np.ndarray,
+    labels: np.ndarray, cost: np.ndarray,
+) -> None:  # fmt: skip
+    """What belongs to the chosen candidate of each pixel: its motion (3, H, W), label and cost (H, W)."""
+    height, width = chosen.shape
+    for y in prange(height):
+        for x in range(width):
+            k = chosen[y, x]
+            for i in range(3):
+                motion[i, y, x] = candidates[k, i, y, x]
+            labels[y, x], cost[y, x] = labels_of[k, y, x], costs[k, y, x]
+
+
 def propose(
     start: Start, grey: np.ndarray, grey2: np.ndarray, camera: StereoCamera | None, matching: MatchingConfig, rigid: RigidConfig,
     objects: ObjectsConfig, fusion: FusionConfig, evidence: EvidenceConfig,
@@ -136,9 +151,9 @@ def propose(
         biased = costs.copy()
         biased[0] += fusion.measured_prior
         biased[2:] += fusion.object_prior
-        chosen = choose(candidates, biased, state[D1], grey, fusion)[None]
-        state[C:] = np.take_along_axis(candidates, chosen[:, None], 0)[0]
-        return np.take_along_axis(labels_of, chosen, 0)[0], np.take_along_axis(costs, chosen, 0)[0]
+        chosen, labels, cost = choose(candidates, biased, state[D1], grey, fusion), np.empty_like(nothing), np.empty_like(grey)
+        _take(chosen, candidates, labels_of, costs, state[C:], labels, cost)
+        return labels, cost
 
     nothing = keep(start).labels
     labels, cost = fuse()
