@@ -20,6 +20,8 @@ from variational.jit import rowwise
 NEAR_M = 0.05
 #: A ray may miss a triangle's edge by this much relative to its inverse depth: none slips between two triangles.
 EDGE_SLACK = 1e-9
+#: Rays that are tested together; arrays of rays end with as many that meet nothing.
+LANES = 4
 
 
 @rowwise
@@ -47,27 +49,16 @@ def setup_triangles(
         First and last column, first and last row; an empty range for a triangle that no ray meets.
     """
     fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
+    m = pose
     for n in range(points.shape[0]):
         bounds[n, 0], bounds[n, 1], bounds[n, 2], bounds[n, 3] = 0, -1, 0, -1
         v = corners[n]
         for c in range(3):
+            x, y, z = points[n, c, 0], points[n, c, 1], points[n, c, 2]
             for i in range(3):
-                x, y, z = points[n, c, 0], points[n, c, 1], points[n, c, 2]
-                v[c, i] = pose[i, 0] * x + pose[i, 1] * y + pose[i, 2] * z + pose[i, 3]
-        if v[0, 2] < NEAR_M and v[1, 2] < NEAR_M and v[2, 2] < NEAR_M:
-            continue
-        low_x, high_x, low_y, high_y = 1e9, -1e9, 1e9, -1e9
-        for i in range(3):
-            j = (i + 1) % 3
-            if v[i, 2] >= NEAR_M:
-                x, y = fx * v[i, 0] / v[i, 2] + cx, fy * v[i, 1] / v[i, 2] + cy
-                low_x, high_x, low_y, high_y = min(low_x, x), max(high_x, x), min(low_y, y), max(high_y, y)
-            if (v[i, 2] >= NEAR_M) != (v[j, 2] >= NEAR_M):
-                s = (NEAR_M - v[i, 2]) / (v[j, 2] - v[i, 2])
-                x = fx * (v[i, 0] + s * (v[j, 0] - v[i, 0])) / NEAR_M + cx
-                y = fy * (v[i, 1] + s * (v[j, 1] - v[i, 1])) / NEAR_M + cy
-                low_x, high_x, low_y, high_y = min(low_x, x), max(high_x, x), min(low_y, y), max(high_y, y)
-        if high_x < -0.5 or high_y < -0.5 or low_x > width - 0.5 or low_y > height - 0.5:
+                v[c, i] = m[i, 0] * x + m[i, 1] * y + m[i, 2] * z + m[i, 3]
+        nearest, farthest = min(v[0, 2], v[1, 2], v[2, 2]), max(v[0, 2], v[1, 2], v[2, 2])
+        if farthest < NEAR_M:
             continue
         a0 = v[1, 1] * v[2, 2] - v[1, 2] * v[2, 1]
         a1 = v[1, 2] * v[2, 0] - v[1, 0] * v[2, 2]
@@ -75,11 +66,27 @@ def setup_triangles(
         determinant = v[0, 0] * a0 + v[0, 1] * a1 + v[0, 2] * a2
         if determinant == 0.0 or (culled[n] and determinant > 0.0):
             continue
+        low_x, high_x, low_y, high_y = 1e9, -1e9, 1e9, -1e9
+        for i in range(3):
+            if v[i, 2] >= NEAR_M:
+                x, y = fx * v[i, 0] / v[i, 2] + cx, fy * v[i, 1] / v[i, 2] + cy
+                low_x, high_x, low_y, high_y = min(low_x, x), max(high_x, x), min(low_y, y), max(high_y, y)
+        if nearest < NEAR_M:  # where the sides cross the nearest plane
+            for i in range(3):
+                j = (i + 1) % 3
+                if (v[i, 2] >= NEAR_M) != (v[j, 2] >= NEAR_M):
+                    s = (NEAR_M - v[i, 2]) / (v[j, 2] - v[i, 2])
+                    x = fx * (v[i, 0] + s * (v[j, 0] - v[i, 0])) / NEAR_M + cx
+                    y = fy * (v[i, 1] + s * (v[j, 1] - v[i, 1])) / NEAR_M + cy
+                    low_x, high_x, low_y, high_y = min(low_x, x), max(high_x, x), min(low_y, y), max(high_y, y)
+        if high_x < -0.5 or high_y < -0.5 or low_x > width - 0.5 or low_y > height - 0.5:
+            continue
+        inverse = 1.0 / determinant
         for i in range(3):
             p, q = v[(i + 1) % 3], v[(i + 2) % 3]
-            r0 = (p[1] * q[2] - p[2] * q[1]) / determinant
-            r1 = (p[2] * q[0] - p[0] * q[2]) / determinant
-            r2 = (p[0] * q[1] - p[1] * q[0]) / determinant
+            r0 = (p[1] * q[2] - p[2] * q[1]) * inverse
+            r1 = (p[2] * q[0] - p[0] * q[2]) * inverse
+            r2 = (p[0] * q[1] - p[1] * q[0]) * inverse
             plane[n, i, 0] = r0 / fx
             plane[n, i, 1] = r1 / fy
             plane[n, i, 2] = r2 - r0 * cx / fx - r1 * cy / fy
@@ -100,13 +107,13 @@ def cast(
     ----------
     plane, bounds : ndarray
         From `setup_triangles`.
-    x, y : ndarray (R,) float64
-        Rays in pixels, sorted by the pixel that they fall in.
-    start : ndarray (height * width + 1,) int64
+    x, y : ndarray (R + LANES,) float64
+        Rays in pixels, sorted by the pixel that they fall in, then NaN.
+    start : ndarray (height * width + 1,) int32
         Rays ``start[i] ... start[i + 1] - 1`` fall in pixel i, counted row by row.
-    inverse_depth : ndarray (R,) float64, written
+    inverse_depth : ndarray (R + LANES,) float64, written
         1 / Z in 1/m; 0 where nothing is met.
-    hit : ndarray (R,) int32, written
+    hit : ndarray (R + LANES,) int32, written
         The triangle; -1 where nothing is met.
     """
     inverse_depth[:] = 0.0
@@ -117,56 +124,90 @@ def cast(
         p00, p01, p02 = plane[n, 0, 0], plane[n, 0, 1], plane[n, 0, 2]
         p10, p11, p12 = plane[n, 1, 0], plane[n, 1, 1], plane[n, 1, 2]
         p20, p21, p22 = plane[n, 2, 0], plane[n, 2, 1], plane[n, 2, 2]
-        narrow = bounds[n, 1] - bounds[n, 0] < 6
+        s0, s1, s2 = -1.0 / p00, -1.0 / p10, -1.0 / p20
+        narrow = bounds[n, 1] - bounds[n, 0] < LANES
         for row in range(bounds[n, 2], bounds[n, 3] + 1):
             first, last = bounds[n, 0], bounds[n, 1]
-            for i in range(0 if narrow else 3):  # columns of this row where b_i can be positive
-                slope = plane[n, i, 0]
-                reach = plane[n, i, 1] * row + plane[n, i, 2] + 0.5 * abs(plane[n, i, 1])
-                if slope > 0.0:
-                    first = max(first, int(max(-reach / slope - 0.5, -1.0)))
-                elif slope < 0.0:
-                    last = min(last, int(min(-reach / slope + 1.5, width * 1.0)))
-            if last < first:
-                continue
-            for ray in range(start[row * width + first], start[row * width + last + 1]):
+            if not narrow:  # columns of this row where all b can be positive
+                low, high = first - 0.5, last + 1.5
+                zero = s0 * (p01 * row + p02 + 0.5 * abs(p01))
+                low, high = max(low, zero - 0.5 if p00 > 0.0 else low), min(high, zero + 1.5 if p00 < 0.0 else high)
+                zero = s1 * (p11 * row + p12 + 0.5 * abs(p11))
+                low, high = max(low, zero - 0.5 if p10 > 0.0 else low), min(high, zero + 1.5 if p10 < 0.0 else high)
+                zero = s2 * (p21 * row + p22 + 0.5 * abs(p21))
+                low, high = max(low, zero - 0.5 if p20 > 0.0 else low), min(high, zero + 1.5 if p20 < 0.0 else high)
+                first, last = max(first, int(low)), min(last, int(high))
+                if last < first:
+                    continue
+            begin, end = start[row * width + first], start[row * width + last + 1]
+            # Whole vectors and no branch: rays beyond the range cannot meet the triangle, or may as well.
+            for k in range((end - begin + LANES - 1) // LANES * LANES):
+                ray = np.uint64(begin) + np.uint64(k)
                 b0 = p00 * x[ray] + p01 * y[ray] + p02
                 b1 = p10 * x[ray] + p11 * y[ray] + p12
                 b2 = p20 * x[ray] + p21 * y[ray] + p22
                 w = b0 + b1 + b2
-                if w > inverse_depth[ray] and w * NEAR_M < 1.0:
-                    slack = -EDGE_SLACK * w
-                    if b0 >= slack and b1 >= slack and b2 >= slack:
-                        inverse_depth[ray] = w
-                        hit[ray] = n
+                slack = -EDGE_SLACK * w
+                nearer = (w > inverse_depth[ray]) & (w * NEAR_M < 1.0) & (b0 >= slack) & (b1 >= slack) & (b2 >= slack)
+                inverse_depth[ray] = w if nearer else inverse_depth[ray]
+                hit[ray] = n if nearer else hit[ray]
 
 
 @rowwise
-def sort_rays(x: np.ndarray, y: np.ndarray, height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
-    """Rays sorted by pixel; those outside the image (or NaN) are left out.
+def _grid_rays(height: int, width: int, x: np.ndarray, y: np.ndarray, start: np.ndarray) -> None:
+    """One ray a pixel, through its centre."""
+    for row in range(height):
+        for column in range(width):
+            i = row * width + column
+            x[i], y[i], start[i] = column, row, i
+    start[height * width] = height * width
+    x[height * width :] = np.nan
+    y[height * width :] = np.nan
 
-    Returns
-    -------
-    order : ndarray (R',) int64
-        Indices of the rays inside, pixel by pixel.
-    start : ndarray (height * width + 1,) int64
-        Where each pixel's rays begin in `order`.
-    """
-    cell = np.full(x.size, -1, np.int64)
-    start = np.zeros(height * width + 1, np.int64)
-    for ray in range(x.size):
-        if x[ray] >= -0.5 and x[ray] < width - 0.5 and y[ray] >= -0.5 and y[ray] < height - 0.5:
-            cell[ray] = math.floor(y[ray] + 0.5) * width + math.floor(x[ray] + 0.5)
-            start[cell[ray] + 1] += 1
-    for i in range(height * width):
-        start[i + 1] += start[i]
-    order = np.empty(start[-1], np.int64)
-    place = start[:-1].copy()
-    for ray in range(x.size):
-        if cell[ray] >= 0:
-            order[place[cell[ray]]] = ray
-            place[cell[ray]] += 1
-    return order, start
+
+@rowwise
+def _edge_rays(edge: np.ndarray, offsets: np.ndarray, x: np.ndarray, y: np.ndarray, start: np.ndarray) -> None:
+    """Several rays in each pixel of a mask."""
+    count, width = 0, edge.shape[1]
+    for row in range(edge.shape[0]):
+        for column in range(width):
+            start[row * width + column] = count
+            if edge[row, column]:
+                for k in range(len(offsets)):
+                    x[count], y[count] = column + offsets[k, 0], row + offsets[k, 1]
+                    count += 1
+    start[edge.size] = count
+    x[count:] = np.nan
+    y[count:] = np.nan
+
+
+@rowwise
+def _sort_rays(
+    place: np.ndarray, height: int, width: int, cell: np.ndarray, start: np.ndarray, order: np.ndarray, x: np.ndarray,
+    y: np.ndarray,
+) -> int:  # fmt: skip
+    """Rays `place` (R, 2) sorted by pixel; those outside the image (or NaN) are left out. Returns how many are left."""
+    start[:] = 0
+    for ray in range(place.shape[0]):
+        u, v = place[ray, 0], place[ray, 1]
+        inside = u >= -0.5 and u < width - 0.5 and v >= -0.5 and v < height - 0.5
+        cell[ray] = int(v + 0.5) * width + int(u + 0.5) if inside else height * width
+        start[cell[ray]] += 1
+    total = 0
+    for i in range(height * width):  # where the next ray of pixel i goes
+        total, start[i] = total + start[i], total
+    start[height * width] = total
+    for ray in range(place.shape[0]):
+        if cell[ray] < height * width:
+            k = start[cell[ray]]
+            start[cell[ray]] = k + 1
+            order[k], x[k], y[k] = ray, place[ray, 0], place[ray, 1]
+    for i in range(height * width, 0, -1):  # each has moved to where the next pixel's rays begin
+        start[i] = start[i - 1]
+    start[0] = 0
+    x[total:] = np.nan
+    y[total:] = np.nan
+    return total
 
 
 class Caster:
@@ -194,10 +235,20 @@ class Caster:
         self.bounds = np.empty((len(points), 4), np.int32)
         setup_triangles(points, pose, culled, intrinsics, height, width, self.corners, self.plane, self.bounds)
 
+    def sight(self) -> np.ndarray:
+        """(4, 3): the ray (x, y) is ``s[0] x + s[1] y + s[2]`` in the world, depth 1; ``s[3]`` is the eye, metres."""
+        fx, fy, cx, cy = self.intrinsics
+        turn = self.pose[:3, :3]
+        return np.stack([turn[0] / fx, turn[1] / fy, turn[2] - turn[0] * cx / fx - turn[1] * cy / fy, -self.pose[:3, 3] @ turn])
+
     def _cast(self, x: np.ndarray, y: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         inverse_depth, hit = np.empty(x.size), np.empty(x.size, np.int32)
         cast(self.plane, self.bounds, x, y, start, self.width, inverse_depth, hit)
         return inverse_depth, hit
+
+    def _rays(self, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Room for rays: x, y, start."""
+        return np.empty(count + LANES), np.empty(count + LANES), np.empty(self.height * self.width + 1, np.int32)
 
     def centres(self) -> tuple[np.ndarray, np.ndarray]:
         """What the pixels' centres see.
@@ -209,38 +260,37 @@ class Caster:
         hit : ndarray (H, W) int32
             Triangle, or -1.
         """
+        rays = self._rays(self.height * self.width)
+        _grid_rays(self.height, self.width, *rays)
+        inverse_depth, hit = self._cast(*rays)
         shape = (self.height, self.width)
-        y, x = np.divmod(np.arange(self.height * self.width), self.width)
-        inverse_depth, hit = self._cast(x.astype(float), y.astype(float), np.arange(x.size + 1))
-        return inverse_depth.reshape(shape), hit.reshape(shape)
+        return inverse_depth[:-LANES].reshape(shape), hit[:-LANES].reshape(shape)
 
-    def within(self, pixels: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Several rays in each of some pixels.
+    def within(self, edge: np.ndarray, offsets: np.ndarray) -> np.ndarray:
+        """What several rays in each of some pixels meet.
 
         Parameters
         ----------
-        pixels : ndarray (P,) int
-            Numbers ``y * width + x`` of pixels, ascending.
+        edge : ndarray (H, W) bool
+            The pixels.
         offsets : ndarray (K, 2) float64
             Positions (x, y) relative to the pixel's centre, within (-0.5, 0.5).
 
         Returns
         -------
-        x, y : ndarray (P * K,) float64
-            The rays in pixels.
         hit : ndarray (P * K,) int32
-            Triangle, or -1.
+            Triangle, or -1, of all rays of one pixel after the other, row by row.
         """
-        row, column = np.divmod(pixels, self.width)
-        x, y = (column[:, None] + offsets[:, 0]).ravel(), (row[:, None] + offsets[:, 1]).ravel()
-        count = np.zeros(self.height * self.width + 1, np.int64)
-        count[pixels + 1] = len(offsets)
-        _, hit = self._cast(x, y, np.cumsum(count))
-        return x, y, hit
+        rays = self._rays(int(np.count_nonzero(edge)) * len(offsets))
+        _edge_rays(edge, offsets, *rays)
+        return self._cast(*rays)[1][:-LANES]
 
-    def nearest(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Inverse depth (R,) of what rays anywhere meet first; NaN outside the image."""
-        order, start = sort_rays(x, y, self.height, self.width)
-        inverse_depth = np.full(x.size, np.nan)
-        inverse_depth[order], _ = self._cast(x[order], y[order], start)
-        return inverse_depth
+    def nearest(self, place: np.ndarray) -> np.ndarray:
+        """Inverse depth (...) of what rays at `place` (..., 2) px meet first; NaN outside the image."""
+        flat = place.reshape(-1, 2)
+        x, y, start = self._rays(len(flat))
+        order = np.empty(len(flat), np.int32)
+        inside = _sort_rays(flat, self.height, self.width, np.empty(len(flat), np.int32), start, order, x, y)
+        inverse_depth = np.full(len(flat), np.nan)
+        inverse_depth[order[:inside]] = self._cast(x, y, start)[0][:inside]
+        return inverse_depth.reshape(place.shape[:-1])

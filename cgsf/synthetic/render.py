@@ -10,10 +10,12 @@ from cgsf.calibration import Calibration
 from cgsf.datasets.sample import Sample, Truth
 from cgsf.errors import InputError
 from cgsf.synthetic.caster import Caster
+from cgsf.synthetic.edges import picture_rays
 from cgsf.synthetic.families import FAMILIES
+from cgsf.synthetic.sampling import pack
 from cgsf.synthetic.scene import Scene, Soup
 from cgsf.synthetic.sensor import Sensor
-from cgsf.synthetic.shading import ILLUMINATION, TEXTURE, Surfaces, shade_image
+from cgsf.synthetic.shading import ILLUMINATION, Surfaces, shade
 from cgsf.synthetic.textures import TextureSource
 from cgsf.synthetic.truth import View, follow, seen
 
@@ -78,12 +80,10 @@ class Renderer:
         camera = scene.camera
         self.intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy], float)
         self.soup = Soup.of(scene)
-        textures = self.soup.textures
-        self.atlas = np.concatenate([texture.levels for texture in textures])
-        self.textures = np.zeros(len(textures), TEXTURE)
-        self.textures["start"] = np.cumsum([0, *(len(texture.levels) for texture in textures[:-1])])
-        self.textures["size"] = [texture.size for texture in textures]
-        self.textures["mirrored"] = [texture.mirrored for texture in textures]
+        records, self.atlas = pack(self.soup.textures)
+        clouds = records[:1].copy()  # the first texture is the sky's, which repeats mirrored whatever it is elsewhere
+        clouds["mirrored"] = True
+        self.textures = np.concatenate([records, clouds])
         self.offsets = _QUARTERS if config.antialias else _QUARTERS[:0]
 
     def stereo(self, time: float) -> tuple[View, View, np.ndarray, np.ndarray]:
@@ -91,7 +91,7 @@ class Renderer:
         points, normals = self.soup.at(self.scene, time)
         illumination, depth_map = self._illumination(points)
         soup = self.soup
-        surfaces = Surfaces(points, normals, soup.uv, soup.material, soup.materials, self.textures, self.atlas)
+        surfaces = Surfaces(normals, soup.uv, soup.material, soup.materials, self.textures, self.atlas)
         pose = self.scene.path.pose(time)
         views, radiances = [], []
         for shift in (0.0, self.scene.camera.baseline_m):
@@ -99,9 +99,10 @@ class Renderer:
             pose[0, 3] -= shift
             caster = Caster(points, pose, self.soup.culled, self.intrinsics, self.height, self.width)
             inverse_depth, hit = caster.centres()
-            radiances.append(
-                shade_image(surfaces, soup.surface, illumination, depth_map, caster, inverse_depth, hit, self.offsets)
-            )
+            rays = picture_rays(caster, inverse_depth, hit, soup.surface, self.offsets)
+            radiance = np.zeros((self.height, self.width, 3), np.float32)
+            shade(*surfaces, illumination, depth_map, caster.plane, caster.sight(), *rays, radiance)
+            radiances.append(radiance)
             views.append(View(caster, inverse_depth, hit))
         return views[0], views[1], radiances[0], radiances[1]
 

@@ -77,11 +77,19 @@ def follow(source: View, target: View) -> tuple[np.ndarray, np.ndarray]:
     return place, there
 
 
+@rowwise
+def _compare(place: np.ndarray, inverse_depth: np.ndarray, nearest: np.ndarray, visible: np.ndarray) -> None:
+    height, width = visible.shape
+    for row in range(height):
+        for column in range(width):
+            x, y = place[row, column, 0], place[row, column, 1]
+            inside = x >= -_ROUNDING_PX and y >= -_ROUNDING_PX
+            inside = inside and x <= width - 1 + _ROUNDING_PX and y <= height - 1 + _ROUNDING_PX
+            visible[row, column] = inside and inverse_depth[row, column] >= nearest[row, column] * (1 - 1e-6)
+
+
 def seen(target: View, place: np.ndarray, inverse_depth: np.ndarray) -> np.ndarray:
     """True where the target camera sees the points from `follow`: inside the image and nothing nearer, (H, W) bool."""
-    x, y = place[..., 0].ravel(), place[..., 1].ravel()
-    nearest = target.caster.nearest(x, y)
-    with np.errstate(invalid="ignore"):
-        last_x, last_y = target.caster.width - 1, target.caster.height - 1
-        inside = (x >= -_ROUNDING_PX) & (y >= -_ROUNDING_PX) & (x <= last_x + _ROUNDING_PX) & (y <= last_y + _ROUNDING_PX)
-        return (inside & (inverse_depth.ravel() >= nearest * (1 - 1e-6))).reshape(inverse_depth.shape)
+    visible = np.empty(inverse_depth.shape, bool)
+    _compare(place, inverse_depth, target.caster.nearest(place), visible)
+    return visible

@@ -139,7 +139,7 @@ def test_nearest_along_a_ray_is_the_brute_force_minimum() -> None:
     _, (left1, _, _, _) = views("street", 2)
     rng = np.random.default_rng(1)
     x, y = rng.uniform(-0.4, WIDTH - 0.6, 80), rng.uniform(-0.4, HEIGHT - 0.6, 80)
-    inverse_depth = left1.caster.nearest(x, y)
+    inverse_depth = left1.caster.nearest(np.stack([x, y], -1))
     plane = left1.caster.plane
     live = left1.caster.bounds[:, 1] >= left1.caster.bounds[:, 0]
     for i in range(80):
