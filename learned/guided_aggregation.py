@@ -1,7 +1,8 @@
 """GA-Net's two guided aggregation layers, as functions: semi-global (SGA) and local (LGA).
 
 Zhang, Prisacariu, Yang, Torr: GA-Net, CVPR 2019 (arXiv:1904.06587), sections 3.1 and 3.2. The plain torch versions run
-on any device and in any dtype; on the CPU in float32 the kernels of ``learned.guided_aggregation_kernels`` take over.
+on any device and in any dtype; on the CPU, in float32 and bfloat16, ``learned.semi_global_kernels`` and
+``learned.local_kernels`` take over.
 """
 
 from __future__ import annotations
@@ -14,7 +15,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from learned import guided_aggregation_kernels as kernels
+from learned.local_kernels import local_backward, local_forward
+from learned.semi_global_kernels import semi_global_backward, semi_global_forward
 
 DIRECTIONS = ("down", "up", "right", "left")
 TERMS = 5
@@ -77,13 +79,11 @@ def _sweep(cost: Tensor, weights: Tensor, axis: int, backwards: bool) -> Tensor:
 class _SemiGlobal(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, cost: Tensor, guidance: Tensor) -> Tensor:
-        planes = _planes(cost)
-        weights = guidance.detach().movedim(1, -1)
-        weights = _large(weights.shape).copy_(weights).unflatten(3, (len(DIRECTIONS), TERMS, -1))
-        out = _large(planes.shape).fill_(-torch.inf)
+        planes, weights = _planes(cost), _weights(guidance)
+        out = _large(planes.shape)
         # which of the four directions won: only the backward pass asks
-        chosen = torch.zeros(planes.shape if any(ctx.needs_input_grad) else (0, 0, 0), dtype=torch.uint8)
-        kernels.semi_global_forward(planes.numpy(), weights.numpy(), out.numpy(), chosen.numpy())
+        chosen = torch.empty(planes.shape if any(ctx.needs_input_grad) else (0, 0, 0), dtype=torch.uint8)
+        semi_global_forward(planes.numpy(), weights.numpy(), out.numpy(), chosen.numpy())
         ctx.save_for_backward(planes, weights, chosen)
         return _volume(out, cost)
 
@@ -91,8 +91,8 @@ class _SemiGlobal(torch.autograd.Function):
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor]:
         planes, weights, chosen = ctx.saved_tensors
         to_planes, to_weights = _large(planes.shape).zero_(), _large(weights.shape)
-        kernels.semi_global_backward(planes.numpy(), weights.numpy(), chosen.numpy(), _planes(gradient).numpy(),
-                                     to_planes.numpy(), to_weights.numpy())
+        semi_global_backward(planes.numpy(), weights.numpy(), chosen.numpy(), _planes(gradient).numpy(),
+                             to_planes.numpy(), to_weights.numpy())
         return _volume(to_planes, gradient), to_weights.flatten(3).movedim(-1, 1)
 
 
@@ -103,18 +103,19 @@ def _large(shape: Sequence[int]) -> Tensor:
 
 
 def _planes(volume: Tensor) -> Tensor:
-    """(B, C, D, H, W) -> (B, D, H * W * C + padding) float32, the layout of the kernels."""
-    batch, channels, depth, height, width = volume.shape
-    plane = height * width * channels
-    planes = _large((batch, depth, plane + kernels.padding(plane)))
-    _volume(planes, volume).copy_(volume.detach())
-    return planes
+    """(B, C, D, H, W) as (B, D, H * W * C) float32, the layout of the kernels: a view if the channels are innermost."""
+    return volume.detach().float().contiguous(memory_format=torch.channels_last_3d).permute(0, 2, 3, 4, 1).flatten(2)
 
 
 def _volume(planes: Tensor, like: Tensor) -> Tensor:
     """The (B, C, D, H, W) view of such planes."""
     batch, channels, depth, height, width = like.shape
-    return planes[..., : height * width * channels].view(batch, depth, height, width, channels).permute(0, 4, 1, 2, 3)
+    return planes.view(batch, depth, height, width, channels).permute(0, 4, 1, 2, 3)
+
+
+def _weights(guidance: Tensor) -> Tensor:
+    """(B, 4 * 5 * C, H, W) as (B, H, W, 4, 5, C): a view if the channels are innermost."""
+    return guidance.detach().movedim(1, -1).contiguous().unflatten(3, (len(DIRECTIONS), TERMS, -1))
 
 
 def local_aggregation(cost: Tensor, guidance: Tensor, times: int = 2) -> Tensor:
@@ -139,7 +140,7 @@ def local_aggregation(cost: Tensor, guidance: Tensor, times: int = 2) -> Tensor:
         raise ValueError(f"guidance of shape {tuple(guidance.shape)} does not fit costs of shape {tuple(cost.shape)}")
     dtype = cost.dtype
     if cost.device.type == "cpu" and dtype in (torch.float32, torch.bfloat16):
-        weights = F.normalize(guidance.float(), p=1, dim=1)
+        weights = F.normalize(guidance.float().contiguous(), p=1, dim=1)
         for _ in range(times):
             cost = _Local.apply(cost.float(), weights)
         return cost.to(dtype)
@@ -167,8 +168,8 @@ class _Local(torch.autograd.Function):
     def forward(ctx: Any, cost: Tensor, weights: Tensor) -> Tensor:
         cost, weights = cost.detach().contiguous(), weights.detach().contiguous()
         ctx.save_for_backward(cost, weights)
-        out = torch.zeros_like(cost)
-        kernels.local_forward(cost.numpy(), weights.numpy(), out.numpy())
+        out = torch.empty_like(cost)
+        local_forward(cost.numpy(), weights.numpy(), out.numpy())
         return out
 
     @staticmethod
@@ -176,5 +177,5 @@ class _Local(torch.autograd.Function):
         cost, weights = ctx.saved_tensors
         gradient = gradient.contiguous()
         to_cost, to_weights = torch.zeros_like(cost), torch.zeros_like(weights)
-        kernels.local_backward(cost.numpy(), weights.numpy(), gradient.numpy(), to_cost.numpy(), to_weights.numpy())
+        local_backward(cost.numpy(), weights.numpy(), gradient.numpy(), to_cost.numpy(), to_weights.numpy())
         return to_cost, to_weights
