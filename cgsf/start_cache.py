@@ -56,7 +56,7 @@ def write_starts(
         No cameras are known there: the solver works as it does without a calibration.
     config : StartConfig
     count : int, optional
-        All samples unless given; may grow from call to call.
+        All samples unless given; later calls on the folder need the same.
     progress : callable, optional
         Called with the number of starts that are complete.
 
@@ -73,8 +73,8 @@ def write_starts(
         done = len(names)
         if made_by != json.loads(json.dumps(about)) or names != cache.names[:done]:
             raise InputError(f"{folder} holds starts made otherwise or of other samples; choose another folder")
-    size, total = cache.images.shape[2:4], len(cache.images)
-    arrays = [open_array(folder / f"{name}.npy", (total, channels, *size), np.float32) for name, channels in _ARRAYS.items()]
+    size = cache.images.shape[2:4]
+    arrays = [open_array(folder / f"{name}.npy", (count, channels, *size), np.float32) for name, channels in _ARRAYS.items()]
     if progress:
         progress(done)
     for index in range(done, count):

@@ -43,14 +43,18 @@ class StartConfig:
     opencv: CompositionConfig = field(default_factory=CompositionConfig)
 
 
-def load_start_config(
-    initial: str, preset: str = "default", disparity: str | None = None, motion: str | None = None
-) -> StartConfig:
-    """The settings of a start under a preset, on request with other networks; `InputError` if they do not fit."""
+def load_start_config(initial: str, preset: str = "default", **networks: str | None) -> StartConfig:
+    """The settings of a start under a preset; `networks` replace fields of `FeedforwardConfig`, unless they are None.
+
+    Raises
+    ------
+    InputError
+        If there is no such preset, or the settings do not fit.
+    """
     from cgsf.pipelines import load_config, with_settings
 
     config: StartConfig = with_settings(load_config("hybrid", preset), {"initial": initial})
-    return replace(config, feedforward=with_settings(config.feedforward, {"disparity": disparity, "motion": motion}))
+    return replace(config, feedforward=with_settings(config.feedforward, networks))
 
 
 def make_start(frames: Frames, config: StartConfig, camera: StereoCamera | None = None, progress: Any = None) -> SceneFlow:

@@ -61,11 +61,12 @@ def samples(
 @preset_option
 @click.option("--disparity", metavar="FILE", help="Weights of the disparity network, in place of those that ship.")
 @click.option("--motion", metavar="FILE", help="Weights of the motion network, in place of those that ship.")
-@click.option("--count", type=click.IntRange(1), help="Only for the first samples; a later call may ask for more.")
+@click.option("--precision", type=click.Choice(["float32", "bfloat16"]), help="Of the networks' convolutions.")
+@click.option("--count", type=click.IntRange(1), help="Only for the first samples.")
 @click.option("--threads", type=click.IntRange(1), help="CPU threads.")
 def starts(
-    output: str, cache: str, initial: str, preset: str, disparity: str | None, motion: str | None, count: int | None,
-    threads: int | None,
+    output: str, cache: str, initial: str, preset: str, disparity: str | None, motion: str | None,
+    precision: str | None, count: int | None, threads: int | None,
 ) -> None:  # fmt: skip
     """Cache the starts of a cache's samples: state, backward flow and evidence of a method."""
     from cgsf.sample_cache import SampleCache
@@ -76,7 +77,7 @@ def starts(
     if threads:
         bound_threads(threads)
     source = SampleCache(cache)
-    config = load_start_config(initial, preset, disparity, motion)
+    config = load_start_config(initial, preset, disparity=disparity, motion=motion, precision=precision)
     with count_bar(min(count or len(source), len(source))) as progress:
         made = write_starts(output, source, config, count, progress)
     click.echo(f"{output}: {len(made)} starts")

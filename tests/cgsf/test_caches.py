@@ -73,14 +73,17 @@ def test_samples_of_a_data_set_without_truth(tmp_path: Path, frames: Path):
     assert np.isnan(truth).all()
 
 
-def test_starts_of_the_networks_go_on_and_grow(tmp_path: Path, frames: Path):
+def test_starts_of_the_networks_go_on(tmp_path: Path, frames: Path, monkeypatch: pytest.MonkeyPatch):
     call("samples", "-o", tmp_path / "c", "--dataset", "frames", "--root", frames, "--size", "64x96")
     disparity, motion = weights(tmp_path)
     arguments = ("starts", "-o", tmp_path / "s", "--cache", tmp_path / "c", "--initial", "feedforward",
                  "--disparity", disparity, "--motion", motion)  # fmt: skip
-    assert call(*arguments, "--count", 2).output.splitlines()[-1].endswith("2 starts")
+    with monkeypatch.context() as patch:
+        patch.setattr("cgsf.start_cache.make_start", _stopped_after(2))
+        assert isinstance(call(*arguments).exception, ZeroDivisionError)
+    assert len(StartCache(tmp_path / "s")) == 2
     first = np.array(StartCache(tmp_path / "s")[0][0])
-    assert call(*arguments).exit_code == 0
+    assert call(*arguments).output.splitlines()[-1].endswith("3 starts")
     starts, cache = StartCache(tmp_path / "s"), SampleCache(tmp_path / "c")
     assert starts.names == cache.names
     np.testing.assert_array_equal(starts[0][0], first)
@@ -92,6 +95,17 @@ def test_starts_of_the_networks_go_on_and_grow(tmp_path: Path, frames: Path):
     weights(tmp_path, seed=1)  # files of the same name, other weights
     assert "made otherwise" in call(*arguments).stderr
     assert not np.array_equal(make_start(to_frames(list(cache[2][0])), config).state(), expected.state())
+
+
+def _stopped_after(count: int):
+    calls = iter(range(count))
+
+    def make(frames, config):
+        if next(calls, None) is None:
+            raise ZeroDivisionError
+        return make_start(frames, config)
+
+    return make
 
 
 @pytest.mark.parametrize("initial", ["variational", "opencv"])
