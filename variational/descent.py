@@ -70,7 +70,7 @@ class RefineConfig:
         of points fix better than one, and disparities of unmatched pixels, which were filled from around.
     """
 
-    warps: int = 2
+    warps: int = 1
     most_px: float = 1.0
     pull: float = 0.2
     firm_pull: float = 20.0

@@ -84,8 +84,11 @@ def find_objects(
         return []
     detector = cv2.SIFT.create(nfeatures=config.features, contrastThreshold=0.01)
     around = cv2.dilate(np.any(surfaces, axis=0).astype(np.uint8), np.ones((9, 9), np.uint8))
-    points1, words1 = detector.detectAndCompute(to_bytes(left1), around)
-    points2, words2 = detector.detectAndCompute(to_bytes(left2), None)
+    # SIFT doubles an image before it begins: halved, its first octave is the image itself, in a quarter of the time
+    half = (left1.shape[1] // 2, left1.shape[0] // 2)
+    small1, small2 = (to_bytes(cv2.resize(image, half, interpolation=cv2.INTER_AREA)) for image in (left1, left2))
+    points1, words1 = detector.detectAndCompute(small1, cv2.resize(around, half, interpolation=cv2.INTER_NEAREST))
+    points2, words2 = detector.detectAndCompute(small2, None)
     if words1 is None or words2 is None or len(points2) < 2:
         return []
     matcher = cv2.BFMatcher(cv2.NORM_L2)
@@ -93,8 +96,9 @@ def find_objects(
     good = [m for m, second in pairs if m.distance < config.ratio * second.distance]
     if len(good) < config.least_matches:
         return []
-    at1 = np.array([points1[m.queryIdx].pt for m in good])
-    at2 = np.array([points2[m.trainIdx].pt for m in good])
+    scale = np.array(left1.shape[::-1]) / half
+    at1 = (np.array([points1[m.queryIdx].pt for m in good]) + 0.5) * scale - 0.5
+    at2 = (np.array([points2[m.trainIdx].pt for m in good]) + 0.5) * scale - 0.5
     x1, y1, x2, y2 = np.rint(np.hstack([at1, at2])).astype(np.intp).T
     first = np.column_stack([at1, disparity[y1, x1]])
     second = np.column_stack([at2, start.match2.disparity[y2, x2]])
