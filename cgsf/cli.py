@@ -21,6 +21,7 @@ COMMANDS = {
     "report": ("report", "One table over several data sets, beside OpenCV's compositions."),
     "cache": ("cache", "Samples and starts on disk, for training."),
     "train": ("train", "Train a network or a refiner by a recipe."),
+    "ablate": ("ablate", "What a refiner owes to its inputs, or to the energy's terms."),
     "demo": ("demo", "Make a small stereo video, solve it, score it: needs no data."),
     "import-weights": ("import_weights", "Published GA-Net and PWC-Net checkpoints for this program."),
     "synthesize": ("synthesize", "Render stereo video with exact truth."),
