@@ -105,8 +105,8 @@ def _path_cost(here: int, before: np.ndarray, x: int, d: int, small: int, jump: 
 
 @inlined
 def _extend(
-    costs: np.ndarray, x: int, step: int, before0: np.ndarray, before1: np.ndarray, before2: np.ndarray, before3: np.ndarray,
-    best0: int, best1: int, best2: int, best3: int, small: int, large_x: int, large_y: int, now0: np.ndarray,
+    costs: np.ndarray, x: int, step: int, parity: int, along: np.ndarray, before1: np.ndarray, before2: np.ndarray,
+    before3: np.ndarray, best0: int, best1: int, best2: int, best3: int, small: int, large_x: int, large_y: int,
     now1: np.ndarray, now2: np.ndarray, now3: np.ndarray, totals: np.ndarray,
 ) -> tuple[np.int16, np.int16, np.int16, np.int16]:  # fmt: skip
     """Pixel x of four paths, the first along the row: adds their costs to its totals, returns their new bests.
@@ -120,11 +120,11 @@ def _extend(
     at, behind, ahead = x + 1, x + 1 - step, x + 1 + step
     for d in range(costs.shape[1]):
         here = np.int16(costs[x, d])
-        value0 = _path_cost(here, before0, 0, d, small, jump0, best0)
+        value0 = _path_cost(here, along, parity, d, small, jump0, best0)
         value1 = _path_cost(here, before1, behind, d, small, jump1, best1)
         value2 = _path_cost(here, before2, at, d, small, jump2, best2)
         value3 = _path_cost(here, before3, ahead, d, small, jump3, best3)
-        now0[0, d + 1], now1[at, d + 1], now2[at, d + 1], now3[at, d + 1] = value0, value1, value2, value3
+        along[1 - parity, d + 1], now1[at, d + 1], now2[at, d + 1], now3[at, d + 1] = value0, value1, value2, value3
         least0, least1 = _min16(least0, value0), _min16(least1, value1)
         least2, least3 = _min16(least2, value2), _min16(least3, value3)
         totals[x, d] = _add16(totals[x, d], _add16(_add16(value0, value1), _add16(value2, value3)))
@@ -135,32 +135,26 @@ def _extend(
 def _sweep_row(
     costs: np.ndarray, large_x: np.ndarray, large_y: np.ndarray, small: int, step: int, before1: np.ndarray,
     before2: np.ndarray, before3: np.ndarray, before_best: np.ndarray, now1: np.ndarray, now2: np.ndarray,
-    now3: np.ndarray, now_best: np.ndarray, even: np.ndarray, odd: np.ndarray, totals: np.ndarray,
+    now3: np.ndarray, now_best: np.ndarray, along: np.ndarray, totals: np.ndarray,
 ) -> None:  # fmt: skip
     """Add one row's four path costs to totals (W, D); step = 1 comes from the top left, -1 from the bottom right.
 
     before*, now* (W + 2, D + 2): path costs of the previous row and of this one. A path begins where the one before it
-    is all zeros: then its cost is the pixel's own. Columns 0 and W + 1 stay zero for that. even, odd (1, D + 2): the
-    path along the row, of the pixel before and of this one in turn.
+    is all zeros: then its cost is the pixel's own. Columns 0 and W + 1 stay zero for that. along (2, D + 2): the path
+    along the row, of the pixel before and of this one in turn.
     """
     width = costs.shape[0]
     best = np.int16(0)
-    even[:, 1:-1] = 0
+    along[0, 1:-1] = 0
     for j in range(width):
         x = j if step == 1 else width - 1 - j
         at, behind, ahead = x + 1, x + 1 - step, x + 1 + step
         large = large_x[x if step == 1 else x + 1]
         best1, best2, best3 = before_best[behind, 0], before_best[at, 1], before_best[ahead, 2]
-        if j % 2 == 0:
-            best, now_best[at, 0], now_best[at, 1], now_best[at, 2] = _extend(
-                costs, x, step, even, before1, before2, before3, best, best1, best2, best3, small, large, large_y[x],
-                odd, now1, now2, now3, totals,
-            )  # fmt: skip
-        else:
-            best, now_best[at, 0], now_best[at, 1], now_best[at, 2] = _extend(
-                costs, x, step, odd, before1, before2, before3, best, best1, best2, best3, small, large, large_y[x],
-                even, now1, now2, now3, totals,
-            )  # fmt: skip
+        best, now_best[at, 0], now_best[at, 1], now_best[at, 2] = _extend(
+            costs, x, step, j % 2, along, before1, before2, before3, best, best1, best2, best3, small, large, large_y[x],
+            now1, now2, now3, totals,
+        )  # fmt: skip
 
 
 @rowwise
@@ -221,7 +215,7 @@ def _aggregate(
     paths = np.full((2, 2, 3, width + 2, disparities + 2), np.int16(UNREACHABLE), np.int16)
     paths[..., 1:-1] = 0
     best = np.zeros((2, 2, width + 2, 3), np.int16)
-    along = np.full((2, 2, 1, disparities + 2), np.int16(UNREACHABLE), np.int16)
+    along = np.full((2, 2, disparities + 2), np.int16(UNREACHABLE), np.int16)
     right = np.empty((2, 2, width + disparities), np.int16)
     for half in range(2):
         for k in prange(2):
@@ -232,7 +226,7 @@ def _aggregate(
                 last, new = paths[k, before], paths[k, now]
                 _sweep_row(
                     costs[y], large_x[y], large_y[y + k], small, 1 - 2 * k, last[0], last[1], last[2], best[k, before],
-                    new[0], new[1], new[2], best[k, now], along[k, 0], along[k, 1], totals[y],
+                    new[0], new[1], new[2], best[k, now], along[k], totals[y],
                 )  # fmt: skip
                 if half == 1:
                     _select_row(totals[y], tolerance, uniqueness, right[k, 0], right[k, 1], disparity[y], matched[y])
