@@ -161,7 +161,8 @@ def fit(
     objective = _Objective(model, loss)
     parallel = dist.is_available() and dist.is_initialized()
     rank, world = (dist.get_rank(), dist.get_world_size()) if parallel else (0, 1)
-    wrapped = DistributedDataParallel(objective) if parallel else objective
+    # a loss need not reach every parameter, as those of heads that only training alone looks at
+    wrapped = DistributedDataParallel(objective, find_unused_parameters=True) if parallel else objective
     trained = [parameter for parameter in model.parameters() if parameter.requires_grad]
     deadline = time.monotonic() + seconds
     numbers: dict[str, float] = {}

@@ -17,7 +17,7 @@ from cgsf.starts import StartConfig
 from learned.augment import AugmentConfig
 from learned.refiner import RefinerConfig
 from learned.training import TrainingConfig
-from tests.cgsf.test_training import NAMES, SIZE, make
+from tests.cgsf.test_training import NAMES, SIZE, make, toml
 from variational.energy import EnergyConfig
 
 SEEN = RefinerConfig(inputs=("state", "loss", "gradient", "image"), layers=((8, 1),), steps=1)
@@ -41,7 +41,7 @@ def test_an_ablation_trains_every_variant_and_goes_on(tmp_path: Path):
     write_starts(tmp_path / "starts", cache, StartConfig("opencv"))
     recipe = Recipe("refiner", "cache", "starts", held_out=1, batch=1, refiner=SEEN, augment=AugmentConfig(48, 64),
                     training=TrainingConfig(precision="float32", learning_rate=1e-2, warmup=0))  # fmt: skip
-    (tmp_path / "recipe.toml").write_text(_toml(to_table(recipe)))
+    (tmp_path / "recipe.toml").write_text(toml(to_table(recipe)))
     arguments = ["ablate", str(tmp_path / "recipe.toml"), "inputs", "-o", str(tmp_path / "out"), "--steps", "2", "--seeds", "2",
                  "--cache", str(tmp_path / "cache"), "--starts", str(tmp_path / "starts")]  # fmt: skip
     result = CliRunner().invoke(main, arguments)
@@ -60,11 +60,3 @@ def test_an_ablation_trains_every_variant_and_goes_on(tmp_path: Path):
 def test_only_refiners_are_ablated(tmp_path: Path, recipe: str):
     refused = CliRunner().invoke(main, ["ablate", recipe, "inputs", "-o", str(tmp_path)])
     assert (refused.exit_code, 'stage "refiner"' in refused.stderr) == (2, True)
-
-
-def _toml(table: dict, name: str = "") -> str:
-    """Plain values and nested tables, enough for a recipe."""
-    lines = [f"[{name}]"] if name else []
-    lines += [f"{key} = {json.dumps(value)}" for key, value in table.items() if not isinstance(value, dict)]
-    lines += [_toml(value, key) for key, value in table.items() if isinstance(value, dict)]
-    return "\n".join(lines) + "\n"

@@ -12,6 +12,7 @@ import torch
 
 import cgsf
 from cgsf import pipelines
+from cgsf.config import to_table
 from cgsf.datasets.frames import FrameFolders
 from cgsf.datasets.sample import Sample, Truth
 from cgsf.errors import InputError
@@ -111,6 +112,14 @@ def test_every_stage_trains_and_exports(folder, tmp_path, stage):
     assert "2 steps" in (tmp_path / "net.safetensors.md").read_text()
 
 
+def toml(table: dict, name: str = "") -> str:
+    """Plain values and nested tables, enough for a recipe."""
+    lines = [f"[{name}]"] if name else []
+    lines += [f"{key} = {json.dumps(value)}" for key, value in table.items() if not isinstance(value, dict)]
+    lines += [toml(value, f"{name}.{key}" if name else key) for key, value in table.items() if isinstance(value, dict)]
+    return "\n".join(lines) + "\n"
+
+
 def joint(folder, frozen=(), **changes) -> Recipe:
     """A joint recipe that begins with small networks."""
     disparity, motion = weights(folder)
@@ -145,6 +154,19 @@ def test_frozen_networks_are_read_from_the_starts(folder, tmp_path, frozen):
     after = torch.load(tmp_path / "ran" / "best.pt", weights_only=True)["model"]
     assert {name for name in before if name.startswith(part)} <= {n for n in before if torch.equal(before[n], after[n])}
     assert not torch.equal(before["refiner.correction.bias"], after["refiner.correction.bias"])
+
+
+@pytest.mark.slow
+def test_two_processes_train_jointly(folder, tmp_path):
+    """Under torchrun, with heads that the joint loss does not reach."""
+    (tmp_path / "recipe.toml").write_text(toml(to_table(joint(folder, batch=1))))
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m", "cgsf.cli",
+               "train", str(tmp_path / "recipe.toml"), "-o", str(tmp_path / "run")]  # fmt: skip
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, timeout=300)
+    assert done.returncode == 0, done.stderr[-2000:]
+    lines = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
+    assert [line["step"] for line in lines] == [1, 2]
+    assert np.isfinite(lines[-1]["score"])
 
 
 def test_supervision_without_truth(folder, tmp_path):
@@ -272,9 +294,11 @@ def test_bad_input_is_one_clear_line(folder, tmp_path):
 
 
 def test_shipped_recipes_fit_the_shipped_networks():
-    for name in ("flow", "disparity", "refiner-variational", "refiner-feedforward"):
-        assert read_recipe(name).stage == name.split("-")[0]
-    assert dataclasses.replace(read_recipe("refiner-variational").refiner, steps=COMPACT.steps) == COMPACT
+    names = ("flow", "disparity", "joint", "refiner-variational", "refiner-feedforward")
+    assert [read_recipe(name).stage for name in names] == ["flow", "disparity", "joint", "refiner", "refiner"]
+    assert read_recipe("self-supervised").supervision == "energy"
+    for name in (*names[2:], "self-supervised"):
+        assert dataclasses.replace(read_recipe(name).refiner, steps=COMPACT.steps) == COMPACT
 
 
 def test_one_shuffled_pass_sees_every_sample_once(folder):
