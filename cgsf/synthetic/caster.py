@@ -11,6 +11,7 @@ Rays are sorted by the pixel that they fall in, so that a triangle visits only t
 """
 
 import math
+from functools import lru_cache
 
 import numpy as np
 
@@ -153,16 +154,12 @@ def cast(
                 hit[ray] = n if nearer else hit[ray]
 
 
-@rowwise
-def _grid_rays(height: int, width: int, x: np.ndarray, y: np.ndarray, start: np.ndarray) -> None:
-    """One ray a pixel, through its centre."""
-    for row in range(height):
-        for column in range(width):
-            i = row * width + column
-            x[i], y[i], start[i] = column, row, i
-    start[height * width] = height * width
-    x[height * width :] = np.nan
-    y[height * width :] = np.nan
+@lru_cache(maxsize=4)
+def _grid_rays(height: int, width: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """One ray a pixel, through its centre: x, y, start."""
+    y, x = np.divmod(np.arange(height * width, dtype=np.int32), np.int32(width))
+    end = np.full(LANES, np.nan)
+    return np.concatenate([x, end]), np.concatenate([y, end]), np.arange(height * width + 1, dtype=np.int32)
 
 
 @rowwise
@@ -260,9 +257,7 @@ class Caster:
         hit : ndarray (H, W) int32
             Triangle, or -1.
         """
-        rays = self._rays(self.height * self.width)
-        _grid_rays(self.height, self.width, *rays)
-        inverse_depth, hit = self._cast(*rays)
+        inverse_depth, hit = self._cast(*_grid_rays(self.height, self.width))
         shape = (self.height, self.width)
         return inverse_depth[:-LANES].reshape(shape), hit[:-LANES].reshape(shape)
 

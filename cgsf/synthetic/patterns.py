@@ -5,31 +5,41 @@ print), not for any one of them.
 """
 
 from collections.abc import Callable
+from functools import lru_cache
 
 import cv2
 import numpy as np
-from scipy.spatial import cKDTree
+
+from variational.jit import rowwise
 
 Pattern = Callable[[np.random.Generator, int], np.ndarray]
 
 
-def noise(rng: np.random.Generator, size: int, slope: float, stretch: float = 1.0) -> np.ndarray:
-    """Power-law noise (S, S), mean 0, deviation 1: amplitude ~ frequency ** -slope; `stretch` draws it along x."""
+@lru_cache(maxsize=8)
+def _frequency(size: int, stretch: float) -> np.ndarray:
     fy, fx = np.fft.fftfreq(size)[:, None] * size, np.fft.rfftfreq(size)[None, :] * size
     frequency = np.hypot(fx * stretch, fy)
     frequency[0, 0] = np.inf
-    spectrum = np.fft.rfft2(rng.standard_normal((size, size))) / np.maximum(frequency, 1) ** slope
+    return np.maximum(frequency, 1)
+
+
+def noise(rng: np.random.Generator, size: int, slope: float, stretch: float = 1.0) -> np.ndarray:
+    """Power-law noise (S, S), mean 0, deviation 1: amplitude ~ frequency ** -slope; `stretch` draws it along x."""
+    spectrum = np.fft.rfft2(rng.standard_normal((size, size)))
+    spectrum /= _frequency(size, stretch) ** slope
     values = np.fft.irfft2(spectrum, s=(size, size))
-    return (values - values.mean()) / max(float(values.std()), 1e-12)
+    values -= values.mean()
+    values /= max(float(values.std()), 1e-12)
+    return values
 
 
 def color(rng: np.random.Generator, saturation: float | None = None, value: float | None = None) -> np.ndarray:
     """A random BGR colour; surfaces of the world are mostly of low saturation."""
-    hue = rng.random() * 6
-    saturation = rng.beta(1.2, 2.2) if saturation is None else saturation
-    value = rng.uniform(0.15, 0.95) if value is None else value
-    ramp = np.clip(np.abs((hue + np.array([4.0, 2.0, 0.0])) % 6 - 3) - 1, 0, 1)  # B, G, R
-    return value * (1 - saturation * (1 - ramp))
+    hue = float(rng.random()) * 6
+    saturation = float(rng.beta(1.2, 2.2) if saturation is None else saturation)
+    value = float(rng.uniform(0.15, 0.95) if value is None else value)
+    ramps = [min(max(abs((hue + shift) % 6 - 3) - 1, 0.0), 1.0) for shift in (4.0, 2.0, 0.0)]  # B, G, R
+    return np.array([value * (1 - saturation * (1 - ramp)) for ramp in ramps])
 
 
 def ramp(rng: np.random.Generator, values: np.ndarray, stops: int = 3) -> np.ndarray:
@@ -59,14 +69,43 @@ def plain(rng: np.random.Generator, size: int) -> np.ndarray:
     return np.clip(color(rng) + 0.012 * noise(rng, size, 1.3)[..., None], 0, 1)
 
 
+@rowwise
+def _nearest_two(points: np.ndarray, size: int, distance: np.ndarray, index: np.ndarray) -> None:
+    """Nearest two `points` (K, K, 2) on the unit torus from each pixel: distances (S, S, 2) in 1 / K, index of the first.
+
+    Point (i, j) lies in cell (i, j) of a K x K grid, so that both are within two cells of the pixel's own.
+    """
+    side = points.shape[0]
+    reach = min(5, side)
+    wrapped = np.arange(3 * side) % side
+    for row in range(size):
+        for column in range(size):
+            y, x = row / size, column / size
+            top, left = int(y * side) + side - reach // 2, int(x * side) + side - reach // 2
+            first, second, best = np.inf, np.inf, 0
+            for a in range(top, top + reach):
+                i = wrapped[a]
+                for b in range(left, left + reach):
+                    j = wrapped[b]
+                    dy, dx = abs(points[i, j, 0] - y), abs(points[i, j, 1] - x)
+                    dy, dx = min(dy, 1.0 - dy), min(dx, 1.0 - dx)
+                    d = dy * dy + dx * dx
+                    if d < first:
+                        first, second, best = d, first, i * side + j
+                    elif d < second:
+                        second = d
+            distance[row, column, 0], distance[row, column, 1] = np.sqrt(first) * side, np.sqrt(second) * side
+            index[row, column] = best
+
+
 def _cells(rng: np.random.Generator, size: int, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Nearest two of `count` random points on a torus: distances (S, S, 2) in their spacing, index, the points."""
     side = max(2, round(np.sqrt(count)))
     jitter = rng.uniform(0.0, 1.0) * (rng.random((side, side, 2)) - 0.5)
-    points = ((np.stack(np.meshgrid(np.arange(side), np.arange(side), indexing="ij"), -1) + 0.5 + jitter) / side).reshape(-1, 2)
-    pixels = np.stack(np.meshgrid(np.arange(size), np.arange(size), indexing="ij"), -1).reshape(-1, 2) / size
-    distance, index = cKDTree(points % 1.0, boxsize=1.0).query(pixels, k=2)
-    return distance.reshape(size, size, 2) * side, index[:, 0].reshape(size, size), points
+    points = (np.stack(np.meshgrid(np.arange(side), np.arange(side), indexing="ij"), -1) + 0.5 + jitter) / side
+    distance, index = np.empty((size, size, 2)), np.empty((size, size), np.int64)
+    _nearest_two(points % 1.0, size, distance, index)
+    return distance, index, points.reshape(-1, 2)
 
 
 def cells(rng: np.random.Generator, size: int) -> np.ndarray:
@@ -88,8 +127,9 @@ def leaves(rng: np.random.Generator, size: int) -> np.ndarray:
     base, spread = color(rng), rng.uniform(0.1, 1.0)
     aspect, kind = rng.uniform(0.3, 1.0), int(rng.integers(3))
     for _ in range(int(rng.integers(150, 500))):
-        radius = size * np.clip(0.02 / (1 - 0.97 * rng.random()), 0.015, 0.3)
-        shade = np.clip((1 - spread) * base * rng.uniform(0.5, 1.4) + spread * color(rng), 0, 1).tolist()
+        radius = size * min(max(0.02 / (1 - 0.97 * rng.random()), 0.015), 0.3)
+        mixed = (1 - spread) * base * rng.uniform(0.5, 1.4) + spread * color(rng)
+        shade = [min(max(channel, 0.0), 1.0) for channel in mixed.tolist()]
         x, y, angle = rng.random() * size, rng.random() * size, rng.random() * 360
         for shift_x in (-size, 0, size):
             for shift_y in (-size, 0, size):
@@ -111,7 +151,8 @@ def foliage(rng: np.random.Generator, size: int) -> np.ndarray:
     image = np.full((size, size, 3), 0.5) * hue * 0.5
     spread, mean_angle = rng.uniform(10, 180), rng.random() * 180
     for step in range(900):
-        shade = np.clip(hue * (0.25 + 1.1 * step / 900 * rng.uniform(0.5, 1.2)) + 0.05 * rng.standard_normal(3), 0, 1).tolist()
+        mixed = hue * (0.25 + 1.1 * step / 900 * rng.uniform(0.5, 1.2)) + 0.05 * rng.standard_normal(3)
+        shade = [min(max(channel, 0.0), 1.0) for channel in mixed.tolist()]
         centre = rng.random(2) * size
         axes = (int(rng.integers(4, 13)), int(rng.integers(2, 5)))
         angle = mean_angle + spread * (rng.random() - 0.5)

@@ -73,41 +73,57 @@ class Sensor:
         """The picture (H, W, 3) float32 in [0, 1] of `radiance` by camera 0 (left) or 1 (right)."""
         gain = np.ones(3) if self.gain is None else self.gain[camera]
         factor = scale * gain * (1.0 if self.flicker is None else self.flicker[frame])
+        width = radiance.shape[1]
+        across = np.repeat((2.0 * np.arange(width) / (width - 1) - 1.0) ** 2, 3)
+        curve = np.linspace(0, 1, 1025) ** (2 * self.gamma)
         image = np.empty_like(radiance)
-        _expose(radiance, factor, self.vignetting, np.linspace(0, 1, 1025) ** (2 * self.gamma), self.grey, image)
+        _expose(radiance, np.tile(factor, width), self.vignetting, across, curve, self.grey, np.empty(3 * width), image)
         if self.blur_px > 0.2:
             image = cv2.GaussianBlur(image, (5, 5), self.blur_px)
         if self.read_noise > 0 or self.shot_noise > 0:
             _add_noise(image, _normals(), int(rng.integers(1 << 62)), self.read_noise, self.shot_noise, self.grey)
         if self.eight_bits:
-            image *= 255
-            np.rint(image, out=image)
-            image /= 255
+            _round(image.reshape(-1), np.arange(256, dtype=np.float32) / 255)
         return image
 
 
 @rowwise
-def _expose(radiance: np.ndarray, factor: np.ndarray, vignetting: float, curve: np.ndarray, grey: bool, out: np.ndarray) -> None:
-    """Gains, vignetting, clip and tone curve; `curve` (K,) is a table over the square root of the light."""
+def _expose(
+    radiance: np.ndarray, factor: np.ndarray, vignetting: float, across: np.ndarray, curve: np.ndarray, grey: bool,
+    light: np.ndarray, out: np.ndarray,
+) -> None:  # fmt: skip
+    """Gains, vignetting, clip and tone curve.
+
+    `factor`, `across` (3 W,): gain and squared place across the image of every value in a row; `curve` (K,) is a table
+    over the square root of the light; `light` (3 W,) is scratch.
+    """
     height, width = radiance.shape[0], radiance.shape[1]
     last = curve.size - 2
     for row in range(height):
         y = 2.0 * row / (height - 1) - 1.0
         for column in range(width):
-            x = 2.0 * column / (width - 1) - 1.0
-            light = 1.0 - vignetting * 0.5 * (x * x + y * y)
-            b, g, r = (
-                radiance[row, column, 0] * factor[0],
-                radiance[row, column, 1] * factor[1],
-                radiance[row, column, 2] * factor[2],
-            )
-            if grey:
-                b = g = r = 0.114 * b + 0.587 * g + 0.299 * r
             for channel in range(3):
-                value = b if channel == 0 else (g if channel == 1 else r)
-                place = math.sqrt(min(max(value * light, 0.0), 1.0)) * (last + 1)
+                light[3 * column + channel] = radiance[row, column, channel] * factor[3 * column + channel]
+        if grey:
+            for column in range(width):
+                j = 3 * column
+                value = 0.114 * light[j] + 0.587 * light[j + 1] + 0.299 * light[j + 2]
+                light[j] = light[j + 1] = light[j + 2] = value
+        for j in range(3 * width):
+            value = light[j] * (1.0 - vignetting * 0.5 * (across[j] + y * y))
+            light[j] = math.sqrt(min(max(value, 0.0), 1.0)) * (last + 1)
+        for column in range(width):
+            for channel in range(3):
+                place = light[3 * column + channel]
                 i = min(int(place), last)
                 out[row, column, channel] = curve[i] + (place - i) * (curve[i + 1] - curve[i])
+
+
+@rowwise
+def _round(values: np.ndarray, levels: np.ndarray) -> None:
+    """Round values in [0, 1] to the nearest of 256 `levels`."""
+    for i in range(values.size):
+        values[i] = levels[int(np.rint(values[i] * np.float32(255.0)))]
 
 
 @lru_cache(maxsize=1)

@@ -199,18 +199,23 @@ def _color(
         half[i] = 0.0
         if shine > 0.0 and lit[i] > 0.0 and fall < 7.0:  # a Gaussian on the sphere, close to half ** shininess
             half[i] = shine * lit[i] * math.exp(-fall)
-    for channel in range(3):
-        sun, above, below = light.color[channel], light.above[channel], light.below[channel]
-        for i in range(count):
-            m = material[i]
-            grain = max(1.0 + amplitude[i] * (2.0 * fine[1, i] - 1.0), 0.0)
-            albedo = materials[m].color[channel, 0] * texture[0, i] + materials[m].color[channel, 1] * texture[1, i]
-            albedo += materials[m].color[channel, 2] * texture[2, i] + materials[m].color[channel, 3]
-            albedo = min(max(albedo, 0.0), 1.0) * grain
-            up = 0.5 - 0.5 * ny[i]
-            ambient = up * above + (1.0 - up) * below
-            direct = lit[i] * max(cosine[i], 0.0)
-            color[channel, i] = albedo * albedo * (ambient + sun * direct + 2.0 * materials[m].glow) + half[i] * sun
+    sun_b, sun_g, sun_r = light.color[0], light.color[1], light.color[2]
+    above_b, above_g, above_r = light.above[0], light.above[1], light.above[2]
+    below_b, below_g, below_r = light.below[0], light.below[1], light.below[2]
+    for i in range(count):
+        m = material[i]
+        grain = max(1.0 + amplitude[i] * (2.0 * fine[1, i] - 1.0), 0.0)
+        b, g, r = texture[0, i], texture[1, i], texture[2, i]
+        mix = materials[m].color
+        blue = mix[0, 0] * b + mix[0, 1] * g + mix[0, 2] * r + mix[0, 3]
+        green = mix[1, 0] * b + mix[1, 1] * g + mix[1, 2] * r + mix[1, 3]
+        red = mix[2, 0] * b + mix[2, 1] * g + mix[2, 2] * r + mix[2, 3]
+        blue, green = min(max(blue, 0.0), 1.0) * grain, min(max(green, 0.0), 1.0) * grain
+        red = min(max(red, 0.0), 1.0) * grain
+        up, direct, glow = 0.5 - 0.5 * ny[i], lit[i] * max(cosine[i], 0.0), 2.0 * materials[m].glow
+        color[0, i] = blue * blue * (up * above_b + (1.0 - up) * below_b + sun_b * direct + glow) + half[i] * sun_b
+        color[1, i] = green * green * (up * above_g + (1.0 - up) * below_g + sun_g * direct + glow) + half[i] * sun_g
+        color[2, i] = red * red * (up * above_r + (1.0 - up) * below_r + sun_r * direct + glow) + half[i] * sun_r
 
 
 @rowwise
