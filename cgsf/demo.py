@@ -6,6 +6,7 @@ import multiprocessing
 import time
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from cgsf import pipelines
@@ -43,13 +44,14 @@ def demo(out: str | Path, method: str = "variational", preset: str = "default") 
         sample = make_sample(FAMILY, SEED, HEIGHT, WIDTH)
         assert sample.truth is not None  # a made scene knows its truth
         seconds = {"making the scene": time.perf_counter() - start}
+        compile_energy()
+        ahead.join()
         results: dict[str, SceneFlow] = {"zero": pipelines.solve(sample.images, "zero", None)}
         result = pipelines.solve(sample.images, method, config, sample.calibration)
         if result.initial is not None:
             results[method + INITIAL] = result.initial
         results[method] = result
         seconds |= result.seconds
-        ahead.join()
         record = {"scene": [FAMILY, SEED], "preset": preset, "settings": to_table(config)}
         write_result(folder, sample.images, result, record, seconds, sample.truth)
     report = Report()
@@ -60,17 +62,27 @@ def demo(out: str | Path, method: str = "variational", preset: str = "default") 
 
 
 def compile_ahead() -> None:
-    """Compile the kernels of the last stages into the cache on disk, beside a process that is busy with the first ones.
+    """Solve a tiny scene, beside a process that is busy with rendering: afterwards the solver's kernels are on disk.
 
-    A fresh install compiles for more than a minute on one core; on two this takes a third of it away.
+    A fresh install compiles for more than a minute on one core; so it does on both.
     """
-    from variational.descent import RefineConfig, refine
+    from variational.camera import StereoCamera
+    from variational.frames import Frames
+    from variational.solver import solve
+
+    rng = np.random.default_rng(0)
+    wall, box = (cv2.GaussianBlur(rng.random((64, 160, 3)), (0, 0), 1.5).astype(np.float32) for _ in range(2))
+    moved = ((0, 0), (-4, -12), (2, -3), (-2, -15))  # left1, right1, left2, right2: columns of the wall, of the box
+    views = [np.roll(wall, at, 1) for at, _ in moved]
+    for view, (_, at) in zip(views, moved, strict=True):
+        view[16:48, 60 + at : 100 + at] = box[16:48, 60:100]
+    solve(Frames(*views), camera=StereoCamera(100.0, 100.0, 80.0, 32.0, 1.0))
+
+
+def compile_energy() -> None:
+    """The energy's kernels, which the picture's loss map asks for."""
     from variational.energy import Energy
     from variational.frames import Frames
-    from variational.terms.constancy import ConstancyConfig
 
-    height, width = 24, 32
-    frames = Frames(*(np.zeros((height, width, 3), np.float32) for _ in range(4)))
-    state, everywhere = np.zeros((5, height, width), np.float32), np.ones((height, width), bool)
-    refine(frames, state, everywhere, (everywhere, everywhere), RefineConfig(warps=1), ConstancyConfig())
-    Energy(frames, backward_flow=np.zeros((height, width, 2), np.float32)).value_and_gradient(state)
+    frames = Frames(*(np.zeros((24, 32, 3), np.float32) for _ in range(4)))
+    Energy(frames, backward_flow=np.zeros((24, 32, 2), np.float32)).value_and_gradient(np.zeros((5, 24, 32), np.float32))
