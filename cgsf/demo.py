@@ -13,7 +13,6 @@ from cgsf import pipelines
 from cgsf.config import to_table
 from cgsf.evaluate import INITIAL, Report
 from cgsf.formats.files import all_or_nothing
-from cgsf.metrics import score
 from cgsf.run import write_result
 from cgsf.scene_flow import SceneFlow
 
@@ -56,8 +55,7 @@ def demo(out: str | Path, method: str = "variational", preset: str = "default") 
         write_result(folder, sample.images, result, record, seconds, sample.truth)
     report = Report()
     for name, estimate in results.items():
-        took = estimate.seconds.get("total", float("nan"))
-        report.frames.append((name, FAMILY, str(SEED), score(estimate, sample.truth), took))
+        report.add(name, FAMILY, str(SEED), estimate, sample.truth, estimate.seconds)
     return report
 
 

@@ -6,6 +6,8 @@
     OUT/METHOD/GROUP/FRAME/scene_flow.npz           a prediction; solved.json beside it has the time
     OUT/frames.csv                                  a row for every method and frame
     OUT/scores.json, OUT/table.md                   pooled by group and method
+    OUT/stages.md                                   median seconds of every stage
+    OUT/confidence.md, OUT/confidence.png           outliers when the least confident pixels are dropped
 
 A frame that has a prediction is not solved again; predictions of another configuration are refused, never mixed. The
 group is the data set's name, or what comes before the slash in a sample's name.
@@ -28,9 +30,9 @@ from typing import Any
 import numpy as np
 
 import cgsf
-from cgsf import pipelines
+from cgsf import pipelines, sparsification
 from cgsf.config import to_table
-from cgsf.datasets import Dataset, Sample, open_dataset
+from cgsf.datasets import Dataset, Sample, Truth, open_dataset
 from cgsf.errors import InputError
 from cgsf.formats.files import read_bytes, write_bytes
 from cgsf.metrics import ENDPOINT_ERRORS, OUTLIERS, REGIONS, Scores, score
@@ -54,10 +56,24 @@ class Report:
         ``seconds`` is the solving's; NaN where that is not known.
     failures : dict
         One line by frame that could not be scored (with ``keep_going``).
+    stages : list of (method, group, seconds by stage)
+        Of the frames whose times are known.
+    curves : dict
+        By (group, method): `cgsf.sparsification.sparsify`, pooled, of the methods that give a confidence.
     """
 
     frames: list[tuple[str, str, str, Scores, float]] = field(default_factory=list)
     failures: dict[str, str] = field(default_factory=dict)
+    stages: list[tuple[str, str, dict[str, float]]] = field(default_factory=list)
+    curves: dict[tuple[str, str], Scores] = field(default_factory=dict)
+
+    def add(self, method: str, group: str, frame: str, estimate: SceneFlow, truth: Truth, seconds: dict[str, float]) -> None:
+        """Score one estimate; `seconds` by stage, may be empty."""
+        self.frames.append((method, group, frame, score(estimate, truth), float(seconds.get("total", np.nan))))
+        if seconds:
+            self.stages.append((method, group, seconds))
+        if estimate.confidence is not None:
+            self.curves[group, method] = self.curves.get((group, method), Scores()) + sparsification.sparsify(estimate, truth)
 
     def pooled(self) -> dict[tuple[str, str], dict[str, float]]:
         """By (group, method): measures pooled over pixels, ``seconds`` (the mean) and ``frames`` (how many)."""
@@ -79,8 +95,18 @@ class Report:
             lines.append(f"| {group} | {values['frames']} | {method} | " + " | ".join(cells) + " |")
         return "\n".join(lines)
 
+    def stage_table(self) -> str:
+        """Median seconds of each stage by set and method, as a Markdown table."""
+        names = list(dict.fromkeys(name for _, _, seconds in self.stages for name in seconds))
+        lines = ["| set | method | " + " | ".join(names) + " |", "|---|---|" + "---:|" * len(names)]
+        for group, method in dict.fromkeys((row[1], row[0]) for row in self.stages):
+            rows = [seconds for other, of, seconds in self.stages if (of, other) == (group, method)]
+            times = [[seconds[name] for seconds in rows if name in seconds] for name in names]
+            lines.append(f"| {group} | {method} | " + " | ".join(f"{np.median(t):.3f}" if t else "" for t in times) + " |")
+        return "\n".join(lines)
+
     def write(self, out: str | Path) -> None:
-        """Write ``frames.csv``, ``scores.json`` and ``table.md`` into `out`."""
+        """Write every table and picture that the module names into `out`."""
         out = Path(out)
         measures = [name + region for region in REGIONS for name in (*OUTLIERS, *ENDPOINT_ERRORS)]
         used = [name for name in measures if any(name in row[3].values() for row in self.frames)]
@@ -96,6 +122,11 @@ class Report:
         record = {"machine": machine(), "scores": pooled, "failures": self.failures}
         write_bytes(out / "scores.json", (json.dumps(record, indent=1) + "\n").encode())
         write_bytes(out / "table.md", (f"{machine()}\n\n{self.table()}\n").encode())
+        if self.stages:
+            write_bytes(out / "stages.md", (f"{machine()}\n\n{self.stage_table()}\n").encode())
+        if self.curves:
+            write_bytes(out / "confidence.md", (sparsification.table(self.curves) + "\n").encode())
+            write_bytes(out / "confidence.png", sparsification.picture(self.curves))
 
 
 def evaluate(
@@ -162,8 +193,8 @@ def evaluate(
                 for label in [method, method + INITIAL] if initial else [method]:
                     if (out / label / place / "scene_flow.npz").is_file():
                         prediction = SceneFlow.load(out / label / place)
-                        seconds = float(_solved(out / label / place).get("seconds", {}).get("total", np.nan))
-                        report.frames.append((label, group, frame, score(prediction, sample.truth), seconds))
+                        seconds = _solved(out / label / place).get("seconds", {})
+                        report.add(label, group, frame, prediction, sample.truth, seconds)
         except InputError as error:
             if not keep_going:
                 raise InputError(f"{sample_name}: {error}") from None

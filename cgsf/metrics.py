@@ -71,6 +71,24 @@ def score(estimate: SceneFlow, truth: Truth) -> Scores:
     InputError
         If the sizes differ.
     """
+    errors, outliers = _errors_and_outliers(estimate, truth)
+    measures = outliers | errors
+    sums = {}
+    for region in REGIONS:
+        for name, values in measures.items():
+            mask = _region(truth, region, name)
+            if mask is not None:
+                chosen = values[mask & ~np.isnan(values)]
+                sums[name + region] = (float(chosen.sum(dtype=np.float64)), chosen.size)
+    return Scores(sums)
+
+
+def outlier_maps(estimate: SceneFlow, truth: Truth) -> dict[str, np.ndarray]:
+    """(H, W) maps by name, 1 where the estimate is an outlier, 0 where not, NaN where the truth is unknown; SF last."""
+    return _errors_and_outliers(estimate, truth)[1]
+
+
+def _errors_and_outliers(estimate: SceneFlow, truth: Truth) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
     disparity1, flow = fill_background(estimate.disparity1), fill_background(estimate.flow)
     disparity2 = fill_background(estimate.disparity2_on_left1)
     errors, outliers = {}, {}
@@ -85,15 +103,7 @@ def score(estimate: SceneFlow, truth: Truth) -> Scores:
     if "D1" in outliers and "F1" in outliers:
         together = np.stack(list(outliers.values()))  # 0, 1, or NaN where unknown
         outliers["SF"] = np.where(np.isnan(together).any(0), np.nan, together.max(0))
-    measures = outliers | errors
-    sums = {}
-    for region in REGIONS:
-        for name, values in measures.items():
-            mask = _region(truth, region, name)
-            if mask is not None:
-                chosen = values[mask & ~np.isnan(values)]
-                sums[name + region] = (float(chosen.sum(dtype=np.float64)), chosen.size)
-    return Scores(sums)
+    return errors, outliers
 
 
 def error_maps(estimate: SceneFlow, truth: Truth) -> dict[str, np.ndarray]:
