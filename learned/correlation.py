@@ -133,7 +133,9 @@ def _forward(first: np.ndarray, padded: np.ndarray, out: np.ndarray) -> None:
             for dx in range(size):
                 total = out[b, dy * size + dx, y]
                 total[:] = 0
-                for c in range(channels):
+                for c in range(0, channels - 3, 4):
+                    _multiply_add_four(first, padded, b, c, y, dy, dx, total)
+                for c in range(channels // 4 * 4, channels):
                     _multiply_add(first[b, c, y], padded[b, c, y + dy, dx:], total)
                 for x in range(width):
                     total[x] *= scale
@@ -214,3 +216,15 @@ def _multiply_add(a: np.ndarray, b: np.ndarray, total: np.ndarray) -> None:
     """total += a b, as far as the shortest of them goes."""
     for x in range(min(a.size, b.size, total.size)):
         total[x] += a[x] * b[x]
+
+
+@lanes
+def _multiply_add_four(a: np.ndarray, b: np.ndarray, i: int, c: int, y: int, dy: int, dx: int, total: np.ndarray
+                       ) -> None:
+    """``_multiply_add`` of four channels at once: a quarter of the traffic of the total."""
+    for x in range(total.size):
+        # unsigned: for a signed index numba asks whether it is negative, and nothing is vectorised
+        at, there = np.uint64(x), np.uint64(x + dx)
+        total[x] += (a[i, c, y, at] * b[i, c, y + dy, there] + a[i, c + 1, y, at] * b[i, c + 1, y + dy, there]
+                     + a[i, c + 2, y, at] * b[i, c + 2, y + dy, there]
+                     + a[i, c + 3, y, at] * b[i, c + 3, y + dy, there])

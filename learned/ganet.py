@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from learned.correlation import disparity_correlation
 from learned.guided_aggregation import local_aggregation, semi_global_aggregation
+from learned.transposed import DoublingConvolution3d
 
 
 @dataclass(frozen=True)
@@ -112,8 +113,9 @@ class GANet(nn.Module):
 
     def _normalised(self, image: Tensor) -> Tensor:
         if self.config.normalised_input:
-            deviation, mean = torch.std_mean(image, dim=(-2, -1), correction=0, keepdim=True)
-            image = ((image - mean) / deviation.clamp(min=1e-6)).flip(1)
+            centred = image - image.mean((-2, -1), keepdim=True)
+            deviation = centred.square().mean((-2, -1), keepdim=True).clamp(min=1e-12).sqrt()
+            image = (centred / deviation).flip(1)
         return image
 
     def _estimate(self, left: Tensor, right: Tensor) -> list[Tensor]:
@@ -129,7 +131,8 @@ class GANet(nn.Module):
     def _volume(self, left: Tensor, right: Tensor) -> Tensor:
         disparities = self.config.max_disparity // self.config.reduction + 1
         if self.config.correlation_groups:
-            return disparity_correlation(left, right, disparities, self.config.correlation_groups)
+            volume = disparity_correlation(left, right, disparities, self.config.correlation_groups)
+            return volume.contiguous(memory_format=torch.channels_last_3d)
         return concatenation_volume(left, right, disparities)
 
     def _pad(self, image: Tensor) -> Tensor:
@@ -297,7 +300,8 @@ class _Aggregation(nn.Module):
             if not guidance:
                 return _expectation(F.softmin(cost, 1))
             probability = F.softmin(local_aggregation(cost, guidance[0]), 1)
-            return _expectation(F.normalize(local_aggregation(probability, guidance[1]), p=1, dim=1))
+            probability = local_aggregation(probability, guidance[1])
+            return _expectation(probability) / probability.abs().sum(1).clamp(min=1e-12)
         if guidance:
             cost = local_aggregation(cost, guidance[0])
         disparity = _expectation(F.softmin(cost, 1)) * reduction
@@ -332,7 +336,7 @@ class _AggregationBlock(nn.Module):
         self.refine = _convolution(channels, channels, dims=3, relu=False)
 
     def forward(self, x: Tensor, guidance: Tensor) -> Tensor:
-        return F.relu_(self.refine(F.relu_(self.norm(semi_global_aggregation(x, guidance)))) + x)
+        return F.relu_(self.refine(F.relu_(self.norm(semi_global_aggregation(x, guidance)))).add_(x))
 
 
 class _Join(nn.Module):
@@ -340,21 +344,24 @@ class _Join(nn.Module):
 
     def __init__(self, inputs: int, outputs: int, up: bool = False, dims: int = 2, relu: bool = True) -> None:
         super().__init__()
-        kernel = (4 if dims == 2 else (3, 4, 4)) if up else 3
-        self.resize = _convolution(inputs, outputs, kernel, 2, dims, transposed=up)
+        self.resize = _convolution(inputs, outputs, 4 if up else 3, 2, dims, transposed=up)
         self.fuse = _convolution(2 * outputs, outputs, dims=dims, relu=relu)
 
     def forward(self, x: Tensor, skip: Tensor) -> Tensor:
         return self.fuse(torch.cat([self.resize(x), skip], 1))
 
 
-def _convolution(inputs: int, outputs: int, kernel: int | tuple[int, ...] = 3, stride: int = 1, dims: int = 2,
-                 relu: bool = True, transposed: bool = False) -> nn.Sequential:
+def _convolution(inputs: int, outputs: int, kernel: int = 3, stride: int = 1, dims: int = 2, relu: bool = True,
+                 transposed: bool = False) -> nn.Sequential:
     """Convolution without bias, batch normalisation, ReLU unless something is still to be added."""
-    kinds = {(2, False): nn.Conv2d, (3, False): nn.Conv3d, (2, True): nn.ConvTranspose2d, (3, True): nn.ConvTranspose3d}
-    padding = kernel // 2 if isinstance(kernel, int) and not transposed else 1
-    layers = [kinds[dims, transposed](inputs, outputs, kernel, stride, padding, bias=False),
-              nn.BatchNorm2d(outputs) if dims == 2 else nn.BatchNorm3d(outputs)]
+    layer: nn.Module
+    if not transposed:
+        layer = (nn.Conv2d if dims == 2 else nn.Conv3d)(inputs, outputs, kernel, stride, kernel // 2, bias=False)
+    elif dims == 2:
+        layer = nn.ConvTranspose2d(inputs, outputs, kernel, stride, 1, bias=False)
+    else:
+        layer = DoublingConvolution3d(inputs, outputs, bias=False)
+    layers = [layer, nn.BatchNorm2d(outputs) if dims == 2 else nn.BatchNorm3d(outputs)]
     return nn.Sequential(*layers, nn.ReLU(inplace=True)) if relu else nn.Sequential(*layers)
 
 

@@ -14,6 +14,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from learned.correlation import correlation
+from learned.transposed import DoublingConvolution2d
 from learned.warp import warp
 
 #: The network speaks in pixels of the input / 20, as the authors trained it.
@@ -105,7 +106,8 @@ class PWCNet(nn.Module):
     def _full_resolution(self, finest: Tensor, shape: torch.Size) -> Tensor:
         """The finest level's motion in pixels of the image, cropped to its shape."""
         scale = 2**self.config.finest
-        full = F.interpolate(finest * MOTION_UNIT_PX, scale_factor=scale, mode="bilinear", align_corners=False)
+        finest = finest.contiguous() * MOTION_UNIT_PX  # of so few channels each is better enlarged on its own
+        full = F.interpolate(finest, scale_factor=scale, mode="bilinear", align_corners=False)
         return full[..., : shape[-2], : shape[-1]]
 
     def estimate(self, first: Tensor, second: Tensor) -> list[Tensor]:
@@ -163,9 +165,9 @@ class _Decoder(nn.Module):
         self.channels = channels
         self.predict = nn.Conv2d(channels, config.outputs, 3, padding=1)
         if not self.finest:
-            self.upsample_features = _upsampling(channels, config.upsampled_features)
+            self.upsample_features = DoublingConvolution2d(channels, config.upsampled_features)
             if not config.residual:
-                self.upsample_motion = _upsampling(config.outputs, config.outputs)
+                self.upsample_motion = DoublingConvolution2d(config.outputs, config.outputs)
 
     def forward(self, first: Tensor, second: Tensor, coarser: tuple[Tensor, Tensor] | None
                 ) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor] | None]:
@@ -188,9 +190,10 @@ class _Decoder(nn.Module):
     def _costs(self, first: Tensor, second: Tensor) -> Tensor:
         if not self.config.cosine:
             return F.leaky_relu(correlation(first, second, self.config.radius), 0.1)
+        dtype = first.dtype
         # the mean over the channels of unit vectors would be tiny: the sum is the cosine
-        costs = correlation(F.normalize(first, dim=1), F.normalize(second, dim=1), self.config.radius)
-        return F.leaky_relu(costs * first.shape[1], 0.1)
+        first, second = (_unit(features) * features.shape[1] ** 0.5 for features in (first, second))
+        return F.leaky_relu(correlation(first, second, self.config.radius).to(dtype), 0.1)
 
     def _upsample(self, motion: Tensor) -> Tensor:
         if self.config.residual:
@@ -199,17 +202,20 @@ class _Decoder(nn.Module):
 
 
 def _convolution(inputs: int, outputs: int, stride: int = 1, dilation: int = 1) -> nn.Sequential:
-    return nn.Sequential(nn.Conv2d(inputs, outputs, 3, stride, dilation, dilation), nn.LeakyReLU(0.1))
-
-
-def _upsampling(inputs: int, outputs: int) -> nn.ConvTranspose2d:
-    return nn.ConvTranspose2d(inputs, outputs, 4, stride=2, padding=1)
+    return nn.Sequential(nn.Conv2d(inputs, outputs, 3, stride, dilation, dilation), nn.LeakyReLU(0.1, inplace=True))
 
 
 def _precise(module: nn.Module, features: Tensor) -> Tensor:
     """Apply a module outside mixed precision: a motion of 100 px in bfloat16 is known to a third of a pixel only."""
     with torch.autocast(features.device.type, enabled=False):
         return module(_at_least_float32(features))
+
+
+def _unit(features: Tensor) -> Tensor:
+    """Features (B, C, H, W) of length one at every pixel, in float32 or better, channels outermost."""
+    features = _at_least_float32(features).contiguous()
+    # bounded before the root: its slope is infinite at zero, where warping looked outside
+    return features / features.square().sum(1, keepdim=True).clamp(min=1e-24).sqrt()
 
 
 def _at_least_float32(tensor: Tensor) -> Tensor:

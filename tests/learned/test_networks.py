@@ -85,6 +85,16 @@ def test_every_parameter_of_pwcnet_learns():
     truth = torch.ones(1, 3, 32, 48)
     multiscale_motion_loss(net.estimate(first, second), truth).backward()
     assert not [name for name, p in net.named_parameters() if p.grad is None or not p.grad.any()]
+    assert all(torch.isfinite(p.grad).all() for p in net.parameters())
+
+
+def test_gradients_stay_finite_where_warping_looks_outside():
+    net = _seeded(PWCNet, SMALL_MOTION).train()
+    for decoder in net.decoders:
+        torch.nn.init.constant_(decoder.predict.bias, 1e3)
+    first, second, *_ = _images(32, 48)
+    net.estimate(first, second)[-1].sum().backward()
+    assert all(torch.isfinite(p.grad).all() for p in net.parameters())
 
 
 def test_motion_loss_ignores_what_is_unknown():
