@@ -96,7 +96,7 @@ def write_cache(
         left = range(len(done), len(names))
         made: Iterable[Sample] = map(make, left)
         if workers > 1 and len(left) > 1:
-            made = stack.enter_context(get_context("spawn").Pool(workers, bound_threads, (1,))).imap(make, left)
+            made = stack.enter_context(get_context("spawn").Pool(workers, bound_threads, (1, False))).imap(make, left)
         for index, sample in zip(left, made, strict=True):
             arrays["images"][index] = [_to_bytes(_centre(image, size)) for image in sample.images]
             truth = truth_state(sample.truth, sample.left1.shape[:2])

@@ -70,7 +70,6 @@ def train(recipe: Recipe, folder: str | Path, seconds: float = float("inf"), pro
         If the samples are missing, or the folder holds another recipe's run.
     """
     folder = Path(folder)
-    claim(folder, recipe)
     cache = SampleCache(recipe.cache)
     if len(cache) <= recipe.held_out:
         raise InputError(f"{recipe.cache}: {len(cache)} samples, of which {recipe.held_out} are held out: none to train with")
@@ -83,6 +82,7 @@ def train(recipe: Recipe, folder: str | Path, seconds: float = float("inf"), pro
     if batches.count < 1:
         raise InputError(f"{recipe.cache}: all of its samples are held out ({recipe.held_out}): none to train with")
     check_truth(recipe, cache)
+    claim(folder, recipe)
     torch.manual_seed(recipe.training.seed)
     stage = STAGES[recipe.stage]
     model = stage.network(recipe)

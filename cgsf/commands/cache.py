@@ -75,7 +75,7 @@ def starts(
     from cgsf.threads import bound_threads
 
     if threads:
-        bound_threads(threads)
+        bound_threads(threads, networks=initial == "feedforward")
     source = SampleCache(cache)
     config = load_start_config(initial, preset, disparity=disparity, motion=motion, precision=precision)
     with count_bar(min(count or len(source), len(source))) as progress:

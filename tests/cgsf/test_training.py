@@ -209,13 +209,15 @@ def test_pictures_for_tensorboard(folder, tmp_path):
     assert {"loss", "SF-0"} <= set(log.Tags()["scalars"])
 
 
-def test_threads_bound_every_library(tmp_path):
+@pytest.mark.parametrize("arguments", [("train", "flow"), ("cache", "starts", "--initial", "feedforward")])
+def test_threads_bound_every_library(tmp_path, arguments):
     """In a process of its own: torch rounds differently once its pool has been set."""
     program = f"""
-import cv2, numba, torch
+import cv2, numba
 from click.testing import CliRunner
 from cgsf.cli import main
-refused = CliRunner().invoke(main, ["train", "flow", "-o", {str(tmp_path)!r}, "--cache", "nowhere", "--threads", "1"])
+refused = CliRunner().invoke(main, [*{arguments}, "-o", {str(tmp_path)!r}, "--cache", "nowhere", "--threads", "1"])
+import torch
 print(refused.exit_code, numba.get_num_threads(), torch.get_num_threads(), cv2.getNumThreads())
 """
     done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True)
