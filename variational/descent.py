@@ -14,7 +14,7 @@ import numpy as np
 
 from variational.energy import Energy, EnergyConfig
 from variational.frames import Frames
-from variational.initialise import Start, sample, to_grey
+from variational.initialise import Start, sample
 from variational.jit import total
 from variational.matching import MatchingConfig
 from variational.minimise import GROUPS, DescendConfig, RelaxConfig, descend, relax
@@ -134,7 +134,7 @@ def from_zero(
     history: History = []
     for level in range(len(shapes) - 1, -1, -1):
         images, shape = pyramid[level], shapes[level]
-        left1, right1, left2, right2 = (to_grey(getattr(images, n)) for n in ("left1", "right1", "left2", "right2"))
+        left1, right1, left2, right2 = images.grey
         coarsest = level == len(shapes) - 1
         state = state if coarsest else resize_state(state, shape)
         band = shape[1] / 3 if coarsest else config.band_px
@@ -186,7 +186,7 @@ def refine(
     if config.warps == 0:
         return state, history
     data = Constancy(frames, constancy)
-    edges, edges2 = edge_factors(to_grey(frames.left1)), edge_factors(to_grey(frames.left2))
+    edges, edges2 = edge_factors(frames.grey[0]), edge_factors(frames.grey[2])
     pull = np.full((*frames.shape, GROUPS), config.pull, np.float32)
     pull[..., 0][~matched[0]] = config.firm_pull
     pull[..., 1:3][rigid] = config.firm_pull

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from functools import cached_property
 
+import cv2
 import numpy as np
 
 
@@ -48,6 +50,12 @@ class Frames:
         """float32 or float64."""
         return self.left1.dtype
 
+    @cached_property
+    def grey(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """left1, right1, left2, right2 as (H, W) float32 grey images, made once."""
+        left1, right1, left2, right2 = (_to_grey(getattr(self, field.name)) for field in fields(self))
+        return left1, right1, left2, right2
+
     def reversed(self) -> Frames:
         """The same four images with time 1 and time 2 exchanged (for the backward flow)."""
         return Frames(self.left2, self.right2, self.left1, self.right1)
@@ -55,6 +63,11 @@ class Frames:
     def astype(self, dtype: np.dtype | type) -> Frames:
         """The four images in `dtype`; without a copy where they have it already."""
         return self if self.dtype == dtype else Frames(*(getattr(self, f.name).astype(dtype) for f in fields(self)))
+
+
+def _to_grey(image: np.ndarray) -> np.ndarray:
+    image = np.asarray(image, np.float32)
+    return np.ascontiguousarray(image[..., 0]) if image.shape[2] == 1 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
 
 
 def _check_image(name: str, image: np.ndarray) -> None:

@@ -39,12 +39,6 @@ class Start:
     match2: StereoMatch
 
 
-def to_grey(image: np.ndarray) -> np.ndarray:
-    """(H, W) float32 grey image of a (H, W, c) one."""
-    image = np.asarray(image, np.float32)
-    return np.ascontiguousarray(image[..., 0]) if image.shape[2] == 1 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
-
-
 def to_bytes(grey: np.ndarray) -> np.ndarray:
     """8-bit version of an image in [0, 1], which is all that OpenCV's matchers read."""
     return np.rint(np.clip(grey, 0, 1) * 255).astype(np.uint8)
@@ -92,7 +86,7 @@ def initialise(frames: Frames, name: StartName, config: MatchingConfig) -> Start
     -------
     Start
     """
-    left1, right1, left2, right2 = (to_grey(getattr(frames, n)) for n in ("left1", "right1", "left2", "right2"))
+    left1, right1, left2, right2 = frames.grey
     shape = left1.shape
     if name == "zero":
         nothing = [

@@ -15,7 +15,7 @@ from variational.energy import EnergyConfig
 from variational.evidence import EvidenceConfig
 from variational.frames import Frames
 from variational.fusion import FusionConfig
-from variational.initialise import MIN_SIDE, StartName, initialise, sample, to_grey
+from variational.initialise import MIN_SIDE, StartName, initialise, sample
 from variational.matching import MatchingConfig
 from variational.objects import ObjectsConfig
 from variational.proposals import MEASURED, keep, propose
@@ -137,7 +137,6 @@ def solve(
         yield
         seconds[name] = time.perf_counter() - begin
 
-    grey = to_grey(frames.left1)
     history: History = []
     reason = "all stages done"
     with stage("start", 0.0):
@@ -150,7 +149,7 @@ def solve(
     if config.proposals:
         with stage("proposals", 0.5):
             proposal = propose(
-                start, grey, to_grey(frames.left2), camera, config.matching, config.rigid, config.objects, config.fusion,
+                start, frames.grey[0], frames.grey[2], camera, config.matching, config.rigid, config.objects, config.fusion,
                 config.evidence,
             )  # fmt: skip
     with stage("refine", 0.8):

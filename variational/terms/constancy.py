@@ -184,7 +184,7 @@ class Constancy:
 
     def __init__(self, frames: Frames, config: ConstancyConfig) -> None:
         self.shape, self.config = frames.shape, config
-        self._features = [features(grey_of(getattr(frames, name)), config) for name in ("left1", "right1", "left2", "right2")]
+        self._features = [features(grey, config) for grey in frames.grey]
 
     def systems(self, state: np.ndarray, seen: tuple[np.ndarray, np.ndarray, np.ndarray]) -> np.ndarray:
         """Gauss-Newton systems of all pixels.
@@ -206,9 +206,3 @@ class Constancy:
         systems = np.empty((*self.shape, SYSTEM), np.float32)
         _systems(state, *self._features, *seen, weights, np.float32(c.zeta**2), np.float32(c.eps_px**2), systems)
         return systems
-
-
-def grey_of(image: np.ndarray) -> np.ndarray:
-    """(H, W) float32 grey image of a (H, W, c) one."""
-    image = np.asarray(image, np.float32)
-    return np.ascontiguousarray(image[..., 0]) if image.shape[2] == 1 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
