@@ -157,20 +157,21 @@ _CUBE = np.array(  # faces, corners in order round each
     float,
 )
 _HALVES = np.array([[0, 2, 1], [0, 3, 2]])
+_CUBE_TRIANGLES = np.ascontiguousarray(_CUBE[:, _HALVES].reshape(12, 3, 3))
+_CUBE_NORMALS = np.repeat(_CUBE.mean(1), 6, axis=0).reshape(12, 3, 3)
+#: Of each corner of the twelve triangles: the side's width and height (as axes), and whether it lies at their far end.
+_CUBE_AXES = np.repeat(np.array([(0, 1), (0, 1), (2, 1), (2, 1), (0, 2), (0, 2)]), 6, axis=0).reshape(12, 3, 2)
+_CUBE_FAR = np.tile(np.array([(0, 0), (1, 0), (1, 1), (0, 1)], float)[_HALVES], (6, 1, 1))
 
 
 def boxes(sizes: ArrayLike, middles: ArrayLike = ((0, 0, 0),)) -> Mesh:
     """Boxes of `sizes` (K, 3) or (3,) m about `middles` (K, 3) m; the texture stands upright on their four sides."""
     sizes, middles = np.broadcast_arrays(np.atleast_2d(np.asarray(sizes, float)), np.asarray(middles, float))
-    faces = _CUBE * (sizes / 2)[:, None, None]
-    width = np.linalg.norm(faces[:, :, 1] - faces[:, :, 0], axis=-1)
-    height = np.linalg.norm(faces[:, :, 2] - faces[:, :, 1], axis=-1)
-    zero = np.zeros_like(width)
-    uv = np.stack([np.stack([zero, width, width, zero], -1), np.stack([zero, zero, height, height], -1)], -1)
-    points = (faces + middles[:, None, None])[:, :, _HALVES].reshape(-1, 3, 3)
+    points = _CUBE_TRIANGLES * (sizes / 2)[:, None, None] + middles[:, None, None]
+    uv = sizes[:, _CUBE_AXES] * _CUBE_FAR
     count = len(sizes)
-    normals = np.tile(np.repeat(_CUBE.mean(1), 6, axis=0).reshape(12, 3, 3), (count, 1, 1))
-    return Mesh(points, normals, uv[:, :, _HALVES].reshape(-1, 3, 2), np.repeat(np.arange(6 * count), 2), True)
+    normals = np.broadcast_to(_CUBE_NORMALS, (count, 12, 3, 3)).reshape(-1, 3, 3)
+    return Mesh(points.reshape(-1, 3, 3), normals, uv.reshape(-1, 3, 2), np.repeat(np.arange(6 * count), 2), True)
 
 
 def box(size: ArrayLike) -> Mesh:
@@ -182,23 +183,18 @@ def hull(points: np.ndarray) -> Mesh:
     """The convex hull of `points` (K, 3) m, flat faces."""
     shape = ConvexHull(points)
     middle = points[shape.vertices].mean(0)
-    triangles = points[shape.simplices]
-    _, surface = np.unique(np.round(shape.equations, 6), axis=0, return_inverse=True)
-    meshes = []
-    for index in range(int(surface.max()) + 1):
-        part = triangles[surface.ravel() == index]
-        normal = shape.equations[surface.ravel() == index][0, :3]
-        along = part[0, 1] - part[0, 0]
-        along = along / np.linalg.norm(along)
-        uv = np.stack([(part - middle) @ along, (part - middle) @ _cross(normal, along)], -1)
-        inward = np.einsum("ni,i->n", _cross(part[:, 1] - part[:, 0], part[:, 2] - part[:, 0]), normal) < 0
-        part, uv = (
-            np.where(inward[:, None, None], part[:, ::-1], part),
-            np.where(inward[:, None, None], uv[:, ::-1], uv),
-        )
-        normals = np.broadcast_to(normal, part.shape).copy()
-        meshes.append(Mesh(part, normals, uv, np.zeros(len(part), np.int64), True))
-    return join(meshes)
+    _, first, surface = np.unique(np.round(shape.equations, 6), axis=0, return_index=True, return_inverse=True)
+    order = np.argsort(surface.ravel(), kind="stable")
+    surface = surface.ravel()[order]
+    triangles, normal = points[shape.simplices[order]], shape.equations[first, :3][surface]
+    along = points[shape.simplices[first, 1]] - points[shape.simplices[first, 0]]
+    along = (along / np.linalg.norm(along, axis=1, keepdims=True))[surface]
+    offset = triangles - middle
+    uv = np.stack([np.einsum("nci,ni->nc", offset, along), np.einsum("nci,ni->nc", offset, _cross(normal, along))], -1)
+    facing = _cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    inward = (np.einsum("ni,ni->n", facing, normal) < 0)[:, None, None]
+    triangles, uv = np.where(inward, triangles[:, ::-1], triangles), np.where(inward, uv[:, ::-1], uv)
+    return Mesh(triangles, np.repeat(normal[:, None], 3, axis=1), uv, surface.astype(np.int64), True)
 
 
 def sweep(profile: Callable[[np.ndarray, np.ndarray], np.ndarray], rings: int, steps: int, uv_size: tuple[float, float]) -> Mesh:
