@@ -20,10 +20,12 @@ from cgsf.errors import InputError
 @click.option("--steps", type=click.IntRange(1), help="Of every strategy, in place of each one's own number.")
 @click.option("--count", type=click.IntRange(1), help="Only the first samples.")
 @click.option("--video", is_flag=True, help="The samples are successive frames: parameters adapts as it goes.")
+@click.option("--threads", type=click.IntRange(1), help="CPU threads.")
 @click.option("--pictures", is_flag=True, help="Energy, gradient, change and error of the steps; times are longer then.")
 def command(
     dataset: str, root: str, output: str, strategies: tuple[str, ...], initial: str, preset: str, options: tuple[str, ...],
-    refiner: str | None, steps: int | None, count: int | None, video: bool, pictures: bool,
+    refiner: str | None, steps: int | None, count: int | None, video: bool,
+    threads: int | None, pictures: bool,
 ) -> None:  # fmt: skip
     """Refine the samples of DATASET in the folder ROOT by several strategies: one table of scores, energy and time."""
     from tqdm import tqdm
@@ -31,7 +33,10 @@ def command(
     from cgsf.datasets import open_dataset
     from cgsf.pipelines import load_config, with_settings
     from cgsf.strategies import compare_strategies, strategies_table
+    from cgsf.threads import bound_threads
 
+    if threads:
+        bound_threads(threads)
     chosen = strategies or (("learned", "outputs", "parameters") if initial == "feedforward" else ("learned", "outputs"))
     if "parameters" in chosen and initial != "feedforward":
         raise InputError("parameters adapts networks: it needs --initial feedforward")

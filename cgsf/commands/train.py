@@ -1,5 +1,7 @@
 """``cgsf train``: networks and refiners by recipe."""
 
+import os
+
 import click
 
 
@@ -25,6 +27,8 @@ def command(
 
     settings = with_changes(read_recipe(recipe), cache, starts, steps)
     numbers = run_recipe(settings, output, seconds=60 * minutes if minutes else float("inf"), threads=threads)
+    if os.environ.get("RANK", "0") != "0":  # the first process of several speaks for all
+        return
     click.echo(", ".join(f"{name} {value:.5g}" for name, value in numbers.items()))
     if export:
         export_best(settings, output, export)
