@@ -1,7 +1,8 @@
 """Time of the networks and of guided aggregation on two threads, warm, at 384 x 1248; peak memory of the deep GA-Net.
 
-``python -m tests.benchmarks.test_networks [CASE ...]`` prints one line a case (no CASE: all, about two minutes), and for
-the aggregation the speed-up over the torch reference; ``pytest tests/benchmarks/test_networks.py`` records the same.
+``python -m tests.benchmarks.test_networks [CASE ...]`` prints the machine's own rates, then one line a case (no CASE: all,
+about two minutes) with its arithmetic, and for the aggregation the speed-up over the torch reference;
+``pytest tests/benchmarks/test_networks.py`` records the same.
 """
 
 import resource
@@ -11,6 +12,7 @@ from time import perf_counter
 import numba
 import pytest
 import torch
+from torch.utils.flop_counter import FlopCounterMode
 
 from learned import ganet, pwcnet
 from learned.feedforward import FeedforwardModule, fold_normalisation
@@ -49,17 +51,19 @@ def feedforward():
     module = FeedforwardModule(*networks, "bfloat16").eval()
 
     @torch.inference_mode()
-    def run():
-        return module(*images(SIZE, 4))
+    def run(size=SIZE):
+        return module(*images(size, 4))
 
     return run
 
 
 def aggregation(function, backward):
     generator = torch.Generator().manual_seed(2)
-    cost = torch.randn(COSTS, generator=generator)
+    # channels innermost, as the networks have them
+    cost = torch.randn(COSTS, generator=generator).contiguous(memory_format=torch.channels_last_3d)
     batch, channels, _, height, width = COSTS
     guidance = torch.randn((batch, 20 * channels, height, width), generator=generator)
+    guidance = guidance.contiguous(memory_format=torch.channels_last)
     cost.requires_grad_(backward)
     guidance.requires_grad_(backward)
 
@@ -99,8 +103,9 @@ def test_pass(benchmark, case):
 
 
 def seconds(case):
-    """The best of a few rounds, and the last result; the deep model runs once, warmed up at a small size."""
+    """The best of a few rounds, the last result and the GFLOP; the deep model runs once, warmed up at a small size."""
     function = CASES[case]()
+    work = 0.0 if "aggregation" in case else arithmetic(case, function)
     if "deep" not in case:
         function()
     times = []
@@ -108,17 +113,55 @@ def seconds(case):
         start = perf_counter()
         result = function()
         times.append(perf_counter() - start)
-    return min(times), result
+    return min(times), result, work
+
+
+def best_seconds(function, rounds=8):
+    """The best of a few calls after a first one."""
+    times = []
+    for _ in range(rounds + 1):
+        start = perf_counter()
+        function()
+        times.append(perf_counter() - start)
+    return min(times[1:])
+
+
+@torch.inference_mode()
+def machine():
+    """What this machine does at this moment: matrix products, convolutions (GFLOP/s) and copies (GB/s)."""
+    rates = []
+    for dtype in (FLOAT, HALF):
+        matrix, image = torch.randn(2048, 2048).to(dtype), torch.randn(1, 128, 96, 312).to(dtype)
+        image = image.contiguous(memory_format=torch.channels_last)
+        kernel = torch.randn(128, 128, 3, 3).to(dtype)
+        products = 2 * 2048**3 / best_seconds(lambda matrix=matrix: matrix @ matrix)
+        arithmetic = 2 * 9 * 128 * 128 * 96 * 312
+        seconds_each = best_seconds(lambda image=image, kernel=kernel: torch.conv2d(image, kernel, padding=1))
+        rates.append(f"{str(dtype)[6:]} {products / 1e9:.0f} (matrices), {arithmetic / seconds_each / 1e9:.0f} (3x3) GFLOP/s")
+    source = torch.ones(32 << 20)
+    target = torch.empty_like(source)
+    rates.append(f"copy {2 * source.nbytes / best_seconds(lambda: target.copy_(source)) / 1e9:.1f} GB/s")
+    return "; ".join(rates)
+
+
+def arithmetic(case, function):
+    """GFLOP of a network's convolutions and matrix products; the deep model's are counted on a 17th of the pixels."""
+    size = (96, 288) if "deep" in case else SIZE
+    with FlopCounterMode(display=False) as counter:
+        function(size)
+    return counter.get_total_flops() / 1e9 * SIZE[0] * SIZE[1] / (size[0] * size[1])
 
 
 def report(names):
     """Print the table."""
     torch.set_num_threads(THREADS)
+    print(f"machine: {machine()}")
     times, disparities = {}, {}
     for name in names:
-        times[name], disparities[name] = seconds(name)
+        times[name], disparities[name], work = seconds(name)
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
-        print(f"{name:36} {1000 * times[name]:9.1f} ms   peak of the process so far {peak:.2f} GB", flush=True)
+        rate = f"{work:.0f} GFLOP, {work / times[name]:.0f} GFLOP/s" if work else ""
+        print(f"{name:36} {1000 * times[name]:9.1f} ms   peak so far {peak:.2f} GB   {rate}", flush=True)
         fast, slow = name.removesuffix(", reference"), name
         if fast != slow and fast in times:
             print(f"{fast:36} {times[slow] / times[fast]:9.1f} times the reference", flush=True)
