@@ -82,6 +82,18 @@ def test_ganet_reproduces_the_published_network(published):
 
 
 @torch.no_grad()
+def test_ganet_in_bfloat16_gives_the_same_disparities(published):
+    net = import_published("ganet", published / "ganet.pth", max_disparity=48)
+    net.config = replace(net.config, normalised_input=False)
+    images = [_image(f"ganet.{side}", (1, 3, 96, 144)) for side in ("left", "right")]
+    exact = net(*images)
+    with torch.autocast("cpu", torch.bfloat16):
+        rounded = net(*images)
+    assert 0 < (rounded - exact).abs().mean() < 0.05
+    assert exact.max() - exact.min() > 5, "equal disparities would say nothing"
+
+
+@torch.no_grad()
 def test_weights_survive_the_disk(published, tmp_path):
     net = import_published("pwcnet", published / "pwcnet.pth.tar")
     save(net, tmp_path / "flow.safetensors", ModelCard("the authors", "CC BY-NC-SA 4.0"))
