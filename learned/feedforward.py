@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from contextlib import AbstractContextManager
 from itertools import pairwise
-from typing import Literal, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-Precision = Literal["float32", "bfloat16"]
+Precision = Literal["auto", "float32", "bfloat16"]
 
 
 class DisparityNetwork(Protocol):
@@ -39,8 +39,9 @@ class FeedforwardModule(nn.Module):
     ----------
     disparity, motion : DisparityNetwork, MotionNetwork
         ``GANet`` and ``PWCNet``, or any others that follow the protocol; modules are trained and moved along.
-    precision : "float32" or "bfloat16"
-        Of convolutions; coordinates, correlations, aggregation and the results stay in float32.
+    precision : "auto", "float32" or "bfloat16"
+        Of convolutions; coordinates, correlations, aggregation and the results stay in float32. auto is bfloat16 where a
+        CPU has instructions for it, and float32 elsewhere.
     """
 
     def __init__(self, disparity: DisparityNetwork, motion: MotionNetwork, precision: Precision = "float32") -> None:
@@ -90,7 +91,13 @@ class FeedforwardModule(nn.Module):
         return self.motion(first, second), self.motion(second, first)
 
     def _mixed(self, device: torch.device) -> AbstractContextManager[None]:
-        return torch.autocast(device.type, torch.bfloat16, enabled=self.precision == "bfloat16")
+        auto = self.precision == "auto" and device.type == "cpu" and _fast_bfloat16()
+        return torch.autocast(device.type, torch.bfloat16, enabled=auto or self.precision == "bfloat16")
+
+
+def _fast_bfloat16() -> bool:
+    capabilities: dict[str, Any] = getattr(torch.cpu, "get_capabilities", dict)()  # older torch cannot tell
+    return bool(capabilities.get("amx_bf16") or capabilities.get("avx512_bf16"))
 
 
 def join_state(disparities: Tensor, motion: Tensor) -> Tensor:

@@ -61,7 +61,7 @@ def samples(
 @preset_option
 @click.option("--disparity", metavar="FILE", help="Weights of the disparity network, in place of those that ship.")
 @click.option("--motion", metavar="FILE", help="Weights of the motion network, in place of those that ship.")
-@click.option("--precision", type=click.Choice(["float32", "bfloat16"]), help="Of the networks' convolutions.")
+@click.option("--precision", type=click.Choice(["auto", "float32", "bfloat16"]), help="Of the networks' convolutions.")
 @click.option("--count", type=click.IntRange(1), help="Only for the first samples.")
 @click.option("--threads", type=click.IntRange(1), help="CPU threads.")
 def starts(
