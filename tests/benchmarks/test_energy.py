@@ -19,10 +19,14 @@ import torch
 from cgsf.gradcheck import random_scene
 from learned.consistency import consistency_map
 from learned.oracle import Oracle
+from tests.benchmarks.test_networks import machine
 from variational.energy import Energy, EnergyConfig
 from variational.frames import Frames
 
 SIZES = [(96, 128), (192, 256), (375, 1242), (540, 960), (1080, 1920)]
+BYTES_A_PIXEL, OPERATIONS_A_PIXEL = 456, 900
+"""Of one value and gradient, counted by hand: 114 planes read or written by sweeps that keep nothing in the cache, and the
+photometric terms' arithmetic."""
 THREADS = min(2, numba.config.NUMBA_NUM_THREADS)
 
 
@@ -133,6 +137,10 @@ def report(size=(375, 1242)):
         function()
         best[kind] = min(_seconds(function) for _ in range(rounds))
         print(f"{kind:8} {1000 * best[kind]:8.2f} ms", flush=True)
+    pixels = size[0] * size[1]
+    print(machine())
+    print(f"the kernels move {BYTES_A_PIXEL * pixels / best['numba'] / 1e9:.1f} GB/s and do "
+          f"{OPERATIONS_A_PIXEL * pixels / best['numba'] / 1e9:.0f} GFLOP/s, as counted in docs/results.md")
     print(f"the twin takes {best['twin'] / best['numba']:.1f} times the kernels' time, "
           f"{best['twin'] / best['bridge']:.1f} times the bridge's")
     for size in SIZES:
