@@ -144,7 +144,7 @@ def test_frozen_networks_are_read_from_the_starts(folder, tmp_path, frozen):
     """Their cached states lead to the same training, and their weights and statistics stay."""
     part = "feedforward." + frozen
     plain = joint(folder, (part,), augment=AugmentConfig(*SIZE, 0, 0, False, 0, 0, 0, 0))
-    config = load_start_config("feedforward", disparity=plain.disparity, motion=plain.motion)
+    config = load_start_config("feedforward", disparity=plain.disparity, motion=plain.motion, precision="float32")
     write_starts(tmp_path / "starts", SampleCache(folder / "cache"), config)
     cached = dataclasses.replace(plain, starts=str(tmp_path / "starts"))
     assert cached.cached_networks == ((frozen,) if frozen else ("disparity", "motion"))
