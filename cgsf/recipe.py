@@ -61,7 +61,10 @@ class Recipe:
     left2_weight: float = 0.1
     """Refiner, joint: weight of D2's error."""
     reliability_weight: float = 1.0
-    """Refiner, joint: weight of the loss that teaches it to tell right values from wrong ones, if it propagates."""
+    """Refiner, joint: weight of the loss that teaches it to tell right values from wrong ones, if it looks at neighbours."""
+    steps_before: int = 0
+    """Refiner, joint: up to this many steps, drawn for each batch, are made before those that learn, so that it has seen
+    its own results and does not spoil them when it is run for longer."""
     robust_px: float = 0.0
     """Refiner, joint: errors far above this pull less; 0 is the paper's absolute error."""
     augment: AugmentConfig = field(default_factory=AugmentConfig)

@@ -80,7 +80,7 @@ def run_refined(frames: Frames, config: RefinedConfig, camera: StereoCamera | No
     if progress:
         progress("refinement", 0.95)
     recorder = StepsRecorder(strategy.steps) if config.steps_picture else None
-    result = strategy(frames, start, recorder)
+    result = strategy(frames, start, camera, recorder)
     if recorder:
         write_steps_picture(config.steps_picture, recorder.kept)
     return result
@@ -108,16 +108,21 @@ class Strategist:
             self.refiner = load_refiner(config.refiner or SHIPPED_REFINERS[config.initial]).to(config.device)
         elif config.strategy == "parameters":
             self.networks = load_networks(config.feedforward).to(config.device)
-        self.strategy = StrategyConfig(config.strategy, config.steps, config.outputs_rate, config.parameters_rate)
+        self.strategy = StrategyConfig(
+            config.strategy, config.steps, config.outputs_rate, config.parameters_rate, config.feedforward.precision
+        )
         self.steps = self.strategy.count(self.refiner)
 
-    def __call__(self, frames: Frames, start: SceneFlow, watch: Watch | None = None) -> SceneFlow:
+    def __call__(
+        self, frames: Frames, start: SceneFlow, camera: StereoCamera | None = None, watch: Watch | None = None
+    ) -> SceneFlow:
         """The refined start. Masks and confidence are the start's, but for what has moved out of sight."""
         from learned.strategies import apply_strategy
 
-        batch = to_batch(frames, start).to(self.config.device)
+        begin = time.perf_counter()
+        batch = to_batch(frames, start, camera).to(self.config.device)
         refined = apply_strategy(self.strategy, batch, self.refiner, self.networks, watch=watch)
-        return self.result(start, refined.state, refined.seconds)
+        return self.result(start, refined.state, time.perf_counter() - begin)
 
     def adapt(self, frames: Frames, start: SceneFlow) -> SceneFlow:
         """As a call, for the next frame of a video: the networks stay adapted (strategy parameters only)."""

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple, cast
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
+from cgsf.camera_motion import find_homography
 from cgsf.datasets.sample import Truth
 from cgsf.errors import InputError
 from cgsf.feedforward import load_network
@@ -17,13 +18,13 @@ from cgsf.metrics import Scores, score
 from cgsf.recipe import Recipe
 from cgsf.scene_flow import SceneFlow
 from cgsf.visualise import comparison
+from learned.alternatives import reliability_loss
 from learned.batch import Batch
 from learned.feedforward import FeedforwardModule
 from learned.ganet import GANet
 from learned.hybrid import Hybrid, HybridConfig, refine
 from learned.losses import disparity_loss, multiscale_motion_loss
 from learned.oracle import Oracle
-from learned.propagation import reliability_loss
 from learned.pwcnet import PWCNet
 from learned.refiner import Refiner
 from learned.state_losses import energy_loss, state_loss
@@ -135,17 +136,21 @@ class _Refined(NamedTuple):
     reliabilities: list[Tensor | None]
 
 
-def _refined(recipe: Recipe, model: nn.Module, batch: Batch) -> _Refined:
-    """The refinement of the batch's starts by a refiner, of the networks' states by a hybrid."""
+def _refined(recipe: Recipe, model: nn.Module, batch: Batch, before: int = 0) -> _Refined:
+    """The refinement of the batch's starts by a refiner, of the networks' states by a hybrid, from the step `before`."""
     if isinstance(model, Hybrid):
         batch, model = model.start(batch), model.refiner
     assert isinstance(model, Refiner)
     oracle = Oracle(*batch.frames, batch.backward_flow, recipe.energy)
+    if before:
+        with torch.no_grad():
+            batch = replace(batch, start=refine(model, batch, oracle, before).states[-1])
     return _Refined(model, oracle, *refine(model, batch, oracle))
 
 
 def _refinement_loss(recipe: Recipe, model: nn.Module, batch: Batch) -> tuple[Tensor, dict[str, float]]:
-    refiner, oracle, states, reliabilities = _refined(recipe, model, batch)
+    before = int(torch.randint(recipe.steps_before + 1, ()))
+    refiner, oracle, states, reliabilities = _refined(recipe, model, batch, before)
     if recipe.supervision == "energy":
         return energy_loss(states, oracle), {}
     errors = [state_loss(state.float(), _truth(batch), recipe.left2_weight, recipe.robust_px) for state in states]
@@ -164,12 +169,12 @@ def _refinement_states(recipe: Recipe, model: nn.Module, batch: Batch) -> Estima
 def _reliability_loss(
     refiner: Refiner, states: list[Tensor], reliabilities: list[Tensor | None], truth: Tensor
 ) -> Tensor:
-    """Mean over the steps; zero for refiners without propagation."""
+    """Mean over the steps; zero for refiners without neighbours."""
     total = truth.new_zeros(())
-    if refiner.propagation is not None:
+    if refiner.config.neighbours:
         for state, logits in zip(states, reliabilities, strict=False):
             assert logits is not None
-            pick = refiner.propagation.pick
+            pick = refiner.grid.pick
             total = total + reliability_loss(logits, pick(state.detach()), pick(truth)) / len(reliabilities)
     return total
 
@@ -190,7 +195,13 @@ def _joint_network(recipe: Recipe) -> nn.Module:
     networks = FeedforwardModule(
         load_network(recipe.disparity), _planar(load_network(recipe.motion)), recipe.training.precision
     )
-    return Hybrid(networks, cast(Refiner, _refiner_network(recipe)), HybridConfig(cached=recipe.cached_networks))
+    refiner = cast(Refiner, _refiner_network(recipe))
+    return Hybrid(networks, refiner, HybridConfig(cached=recipe.cached_networks), _homographies)
+
+
+def _homographies(states: Tensor, backward_flows: Tensor) -> Tensor:
+    maps = zip(states.float().cpu().numpy(), backward_flows.permute(0, 2, 3, 1).float().cpu().numpy(), strict=True)
+    return torch.from_numpy(np.stack([find_homography(state, backward) for state, backward in maps])).to(states.device)
 
 
 def _begin_with(model: nn.Module, name: str) -> nn.Module:

@@ -1,8 +1,8 @@
 """Starts for the refiner on disk: what a method makes of every sample of a `SampleCache`, computed once.
 
 A folder with ``start.npy`` (N, 5, H, W) float32, ``backward.npy`` (N, 2, H, W) float32 (flow left2 -> left1),
-``evidence.npy`` (N, 2, H, W) float32 (confidence and visibility in [0, 1]) and ``cache.json``: what made them, and the
-names of the samples that are complete.
+``evidence.npy`` (N, 2, H, W) float32 (confidence and visibility in [0, 1]), ``homography.npy`` (N, 4, 4) float64 (the
+camera's motion on x, y, disparity, 1) and ``cache.json``: what made them, and the names of the samples that are complete.
 """
 
 from __future__ import annotations
@@ -14,13 +14,14 @@ from typing import Any
 
 import numpy as np
 
+from cgsf.camera_motion import find_homography
 from cgsf.errors import InputError
 from cgsf.formats.files import write_bytes
 from cgsf.intake import to_frames
 from cgsf.sample_cache import SampleCache, open_array
 from cgsf.starts import StartConfig, describe, make_start, start_maps
 
-_ARRAYS = {"start": 5, "backward": 2, "evidence": 2}
+_MAPS = {"start": 5, "backward": 2, "evidence": 2}
 _INDEX = "cache.json"
 
 
@@ -31,16 +32,18 @@ class StartCache:
         self.folder = Path(folder)
         self.about, self.names = _read_index(self.folder)
         try:
-            self.maps = {name: np.load(self.folder / f"{name}.npy", mmap_mode="r", allow_pickle=False) for name in _ARRAYS}
+            self.arrays = {
+                name: np.load(self.folder / f"{name}.npy", mmap_mode="r", allow_pickle=False) for name in (*_MAPS, "homography")
+            }
         except (OSError, ValueError) as error:
             raise InputError(f"{self.folder}: the starts cannot be read ({error}); make them anew") from None
 
     def __len__(self) -> int:
         return len(self.names)
 
-    def __getitem__(self, index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Start (5, H, W), backward flow (2, H, W) and evidence (2, H, W) of the cache's sample of this index."""
-        return self.maps["start"][index], self.maps["backward"][index], self.maps["evidence"][index]
+    def __getitem__(self, index: int) -> dict[str, np.ndarray]:
+        """``start`` (5, H, W), ``backward`` (2, H, W), ``evidence`` (2, H, W) and ``homography`` (4, 4) of a sample."""
+        return {name: array[index] for name, array in self.arrays.items()}
 
 
 def write_starts(
@@ -74,13 +77,16 @@ def write_starts(
         if made_by != json.loads(json.dumps(about)) or names != cache.names[:done]:
             raise InputError(f"{folder} holds starts made otherwise or of other samples; choose another folder")
     size = cache.images.shape[2:4]
-    arrays = [open_array(folder / f"{name}.npy", (count, channels, *size), np.float32) for name, channels in _ARRAYS.items()]
+    arrays = [open_array(folder / f"{name}.npy", (count, channels, *size), np.float32) for name, channels in _MAPS.items()]
+    arrays.append(open_array(folder / "homography.npy", (count, 4, 4), np.float64))
     if progress:
         progress(done)
     for index in range(done, count):
         start = make_start(to_frames(list(cache[index][0])), config)
-        for array, maps in zip(arrays, start_maps(start), strict=True):
-            array[index] = maps
+        maps = start_maps(start)
+        homography = find_homography(maps[0], maps[1].transpose(1, 2, 0))
+        for array, values in zip(arrays, (*maps, homography), strict=True):
+            array[index] = values
             array.flush()
         write_bytes(folder / _INDEX, json.dumps({"about": about, "names": cache.names[: index + 1]}).encode())
         if progress:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from cgsf.baselines import CompositionConfig, compose
+from cgsf.camera_motion import find_homography
 from cgsf.config import to_table
 from cgsf.errors import InputError
 from cgsf.feedforward import FeedforwardConfig, run_networks, to_tensor, weights_path
@@ -73,15 +74,17 @@ def start_maps(start: SceneFlow) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return state, backward, np.stack([confidence, start.visible.astype(np.float32)])
 
 
-def to_batch(frames: Frames, start: SceneFlow) -> Batch:
-    """Frames and a start as tensors."""
+def to_batch(frames: Frames, start: SceneFlow, camera: StereoCamera | None = None) -> Batch:
+    """Frames and a start as tensors, with the camera's motion in it."""
     import torch
 
     from learned.batch import Batch
 
     images = torch.stack([to_tensor(image) for image in (frames.left1, frames.right1, frames.left2, frames.right2)], 1)
-    state, backward, evidence = (torch.from_numpy(np.ascontiguousarray(maps))[None] for maps in start_maps(start))
-    return Batch(images, None, state, backward, evidence)
+    maps = start_maps(start)
+    homography = torch.from_numpy(find_homography(maps[0], start.backward_flow, camera))[None]
+    state, backward, evidence = (torch.from_numpy(np.ascontiguousarray(each))[None] for each in maps)
+    return Batch(images, None, state, backward, evidence, homography)
 
 
 def describe(config: StartConfig) -> dict[str, Any]:

@@ -157,7 +157,7 @@ def _refine_all(
     for name, runner in runners.items():
         recorder = StepsRecorder(runner.steps) if pictures and name != "parameters" else None
         adapting = video and name == "parameters"
-        result = runner.adapt(frames, start) if adapting else runner(frames, start, recorder)
+        result = runner.adapt(frames, start) if adapting else runner(frames, start, camera, recorder)
         label = "parameters, adapting" if adapting else name
         folder = out / name / sample.name
         folder.mkdir(parents=True, exist_ok=True)

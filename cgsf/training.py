@@ -116,8 +116,10 @@ class Batches:
         images, names = images.permute(0, 1, 4, 2, 3), (self.cache.names[index],)
         if self.starts is None:
             return Batch(images, truth, names=names)
-        start, backward, evidence = (torch.from_numpy(np.array(array)[None]) for array in self.starts[index])
-        return Batch(images, truth, start, backward, evidence, names)
+        known = {name: torch.from_numpy(np.array(array)[None]) for name, array in self.starts[index].items()}
+        return Batch(
+            images, truth, known["start"], known["backward"], known["evidence"], known["homography"], names
+        )  # fmt: skip
 
     def held_out(self) -> Iterator[Batch]:
         """The samples that are never trained with, whole and unchanged."""

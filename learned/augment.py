@@ -53,7 +53,17 @@ def augment(batch: Batch, config: AugmentConfig, generator: Generator) -> Batch:
 
 def crop(batch: Batch, top: int, left: int, height: int, width: int) -> Batch:
     """The same window of every map."""
-    return batch.map(lambda maps: maps[..., top : top + height, left : left + width])
+    window = batch.map(lambda maps: maps[..., top : top + height, left : left + width])
+    return _recoordinated(window, (1, -left), (1, -top))
+
+
+def _recoordinated(batch: Batch, x: tuple[float, float], y: tuple[float, float]) -> Batch:
+    """The camera's motion after pixels (x, y) have gone to (x[0] x + x[1], y[0] y + y[1]); disparities scale along x."""
+    if batch.homography is None:
+        return batch
+    change = torch.eye(4, dtype=batch.homography.dtype)
+    change[0, 0], change[0, 3], change[1, 1], change[1, 3], change[2, 2] = x[0], x[1], y[0], y[1], x[0]
+    return replace(batch, homography=change @ batch.homography @ change.inverse())
 
 
 def _augment_one(sample: Batch, config: AugmentConfig, generator: Generator) -> Batch:
@@ -101,7 +111,7 @@ def resized(batch: Batch, size: tuple[int, int]) -> Batch:
 
     images = smooth(batch.images.flatten(0, 1)).unflatten(0, batch.images.shape[:2])
     return replace(
-        batch,
+        _recoordinated(batch, (sx, (sx - 1) / 2), (sy, (sy - 1) / 2)),
         images=images,
         truth=nearest(batch.truth, factors),
         start=nearest(batch.start, factors),
@@ -123,7 +133,7 @@ def _mirrored(batch: Batch) -> Batch:
 
     images = batch.images.flip(-2)
     return replace(
-        batch,
+        _recoordinated(batch, (1, 0), (-1, images.shape[-2] - 1)),
         images=images,
         truth=flip(batch.truth, 4),
         start=flip(batch.start, 4),

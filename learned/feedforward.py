@@ -69,7 +69,7 @@ class FeedforwardModule(nn.Module):
     def disparities(self, left1: Tensor, right1: Tensor, left2: Tensor, right2: Tensor) -> Tensor:
         """D1 and D2 alone, (B, 2, H, W)."""
         size = left1.shape[0], *left1.shape[2:]
-        with self._mixed(left1.device):
+        with mixed_precision(self.precision, left1.device):
             d1, d2 = self.disparity(left1, right1), self.disparity(left2, right2)
         if d1.shape != size or d2.shape != size:
             raise ValueError(f"the network must return disparity {size}, not {tuple(d1.shape)}")
@@ -78,7 +78,7 @@ class FeedforwardModule(nn.Module):
     def motions(self, left1: Tensor, left2: Tensor) -> tuple[Tensor, Tensor]:
         """Motion (B, 3, H, W: u, v and the disparity change) and backward flow (B, 2, H, W) alone."""
         size = left1.shape[0], 3, *left1.shape[2:]
-        with self._mixed(left1.device):
+        with mixed_precision(self.precision, left1.device):
             forward, backward = self._both_ways(left1, left2)
         if forward.shape != size:
             raise ValueError(f"the network must return motion {size}, not {tuple(forward.shape)}")
@@ -90,9 +90,11 @@ class FeedforwardModule(nn.Module):
             return self.motion.both_ways(first, second)
         return self.motion(first, second), self.motion(second, first)
 
-    def _mixed(self, device: torch.device) -> AbstractContextManager[None]:
-        auto = self.precision == "auto" and device.type == "cpu" and _fast_bfloat16()
-        return torch.autocast(device.type, torch.bfloat16, enabled=auto or self.precision == "bfloat16")
+
+def mixed_precision(precision: Precision, device: torch.device) -> AbstractContextManager[None]:
+    """A context in which convolutions have this precision; auto is bfloat16 where a CPU has instructions for it."""
+    auto = precision == "auto" and device.type == "cpu" and _fast_bfloat16()
+    return torch.autocast(device.type, torch.bfloat16, enabled=auto or precision == "bfloat16")
 
 
 def _fast_bfloat16() -> bool:

@@ -9,10 +9,11 @@ from typing import Literal, NamedTuple, get_args
 import torch
 from torch import Tensor, nn
 
+from learned.alternatives import Grid, camera_motion
 from learned.batch import Batch
 from learned.feedforward import FeedforwardModule, join_state
 from learned.oracle import Oracle
-from learned.refiner import Refiner
+from learned.refiner import Refiner, View
 
 #: Called after each evaluation with the step t, the state X_t, the energy's map and gradient there (None if not
 #: needed).
@@ -55,11 +56,14 @@ def refine(
     """
     if batch.start is None:
         raise ValueError("there is no start to refine")
-    left1, _, left2, _ = batch.frames
-    images = torch.cat([left1, left2], 1) if refiner.config.needs_images else None
     steps = refiner.config.steps if steps is None else steps
     if oracle is None and (refiner.config.needs_energy or watch):
         oracle = Oracle(*batch.frames, batch.backward_flow)
+    camera_loss = None
+    if refiner.config.neighbours and steps > 0:
+        assert oracle is not None
+        camera_loss, _ = oracle.features(still(batch.start, batch.homography))
+    contrasts = refiner.contrasts(batch)
     states, reliabilities = [batch.start], []
     for t in range(steps + 1):
         loss = gradient = None
@@ -69,10 +73,18 @@ def refine(
             watch(t, states[-1], loss, gradient)
         if t < steps:
             state = states[-1].detach() if refiner.config.detached else states[-1]
-            update = refiner(state, loss, gradient, images, batch.evidence)
+            update = refiner(View(state, loss, gradient, camera_loss, contrasts), batch)
             states.append(state + update.change)
             reliabilities.append(update.reliability)
     return Refinement(states, reliabilities)
+
+
+def still(state: Tensor, homography: Tensor | None) -> Tensor:
+    """The state (B, 5, H, W) if nothing moved but the camera, by its homography (B, 4, 4); None leaves it as it is."""
+    if homography is None:
+        return state
+    motion = camera_motion(state[:, 0], Grid(1).coordinates(state), homography)
+    return torch.cat([state[:, :2], motion], 1)
 
 
 NetworkName = Literal["disparity", "motion"]
@@ -99,11 +111,17 @@ class Hybrid(nn.Module):
     refiner : Refiner
         G.
     config : HybridConfig
+    find_homographies : callable, optional
+        The camera's motions (B, 4, 4) of a start, from its state and backward flow.
     """
 
-    def __init__(self, feedforward: nn.Module, refiner: Refiner, config: HybridConfig = HybridConfig()) -> None:
+    def __init__(
+        self, feedforward: nn.Module, refiner: Refiner, config: HybridConfig = HybridConfig(),
+        find_homographies: Callable[[Tensor, Tensor], Tensor] | None = None,
+    ) -> None:  # fmt: skip
         super().__init__()
         self.feedforward, self.refiner, self.config = feedforward, refiner, config
+        self.find_homographies = find_homographies
 
     def forward(self, batch: Batch, oracle: Oracle | None = None, watch: Watch | None = None) -> Refinement:
         """The refinement of the networks' state."""
@@ -127,4 +145,6 @@ class Hybrid(nn.Module):
             left1, _, left2, _ = batch.frames
             motion, backward = self.feedforward.motions(left1, left2)
             state = join_state(batch.start[:, :2], motion)  # type: ignore[index]
-        return replace(batch, start=state.float(), backward_flow=backward.float().detach())
+        state, backward = state.float(), backward.float().detach()
+        homography = self.find_homographies(state.detach(), backward) if self.find_homographies else batch.homography
+        return replace(batch, start=state, backward_flow=backward, homography=homography)

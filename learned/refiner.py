@@ -2,7 +2,8 @@
 
 ``X_{t+1} = X_t + G(X_t, L(X_t), dL/dX(X_t))`` (Chen et al., section "Refinement"), the same weights in every step; the
 loop over steps stands in `learned.hybrid`. The published network is three 3 x 3 convolutions with 512 hidden channels;
-the compact one works on blocks of pixels, sees further by dilation, and may take over the values of neighbours.
+the compact one works on every second pixel, sees further by dilation, and may take over values that something else
+vouches for (`learned.alternatives`).
 """
 
 from __future__ import annotations
@@ -14,15 +15,22 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from learned.propagation import Propagation
+from learned.alternatives import Grid, Neighbours, camera_motion, second_pair
+from learned.batch import Batch
 
 Input = Literal["state", "loss", "gradient", "deviation", "image", "evidence"]
 
 # What brings each input to a range of about one. Pixels of motion, the energy's map (its photometric terms end at 3),
-# the gradient (the coupling's is 1 a pixel) and the state's deviation from its surroundings, in pixels.
-_STATE_SCALE, _LOSS_SCALE, _GRADIENT_SCALE, _DEVIATION_SCALE = 0.05, 0.5, 1.0, 0.25
-_LOSS_MOST, _GRADIENT_MOST, _DEVIATION_MOST = 20.0, 5.0, 40.0
+# the gradient (the coupling's is 1 a pixel).
+_STATE_SCALE, _LOSS_SCALE, _GRADIENT_SCALE = 0.05, 0.5, 1.0
+_LOSS_MOST, _GRADIENT_MOST = 20.0, 5.0
 _SURROUNDINGS_PX = 16  # side of the box that the deviation is measured against
+# Affinity of neighbours falls by this factor's exponential with their difference in intensity, before training.
+_EDGE_SHARPNESS = 10.0
+# Gates: D1 from its neighbours and from the second pair, motion from its neighbours and the camera's, C from the second
+# pair.
+_GATES = 5
+_CORRECTION_MOST_PX = 4.0  # a step; larger changes need somebody who vouches for them
 
 
 @dataclass(frozen=True)
@@ -37,11 +45,11 @@ class RefinerConfig:
     layers: tuple[tuple[int, int], ...] = ((512, 1), (512, 1))
     """(channels, dilation) of the hidden convolutions."""
     divisor: int = 1
-    """Work on blocks of divisor x divisor pixels, all of whose values are inputs and outputs: 1 / divisor**2 of the
-    time, nothing is averaged."""
-    propagation: tuple[int, ...] = ()
-    """Distances, in blocks, of neighbours whose values a pixel may take over (`learned.propagation`); empty as
-    published."""
+    """Look at one pixel of each block of divisor x divisor, and at the mean of energy and gradient there: 1 / divisor**2
+    of the time."""
+    neighbours: tuple[int, ...] = ()
+    """Distances, in blocks, of neighbours whose values a pixel may take over, as those of the camera's motion and of the
+    second pair; empty as published: corrections alone."""
     detached: bool = False
     """Each step learns from its own loss alone, none through the steps before: a half of the training time."""
     steps: int = 5
@@ -53,34 +61,46 @@ class RefinerConfig:
             raise ValueError(f"inputs must be different ones of {', '.join(get_args(Input))}; got {self.inputs}")
         if (self.evidence > 0) != ("evidence" in self.inputs):
             raise ValueError("evidence must count the channels of the input 'evidence', 0 without it")
-        if self.divisor < 1 or self.steps < 0 or not self.layers or any(distance < 1 for distance in self.propagation):
+        if self.divisor < 1 or self.steps < 0 or not self.layers or any(distance < 1 for distance in self.neighbours):
             raise ValueError("divisor and distances must be at least 1, steps not negative, and there must be a hidden layer")
 
     @property
     def channels(self) -> int:
-        """Input channels for each pixel."""
+        """Input channels."""
         count = {"state": 5, "loss": 1, "gradient": 5, "deviation": 5, "image": 6, "evidence": self.evidence}
-        return sum(count[name] for name in self.inputs)
-
-    @property
-    def needs_images(self) -> bool:
-        """Whether left1 and left2 must be given."""
-        return "image" in self.inputs or bool(self.propagation)
+        beside = 2 * (self.divisor**2 - 1) + 6 if self.neighbours else 0
+        return sum(count[name] for name in self.inputs) + beside
 
     @property
     def needs_energy(self) -> bool:
         """Whether the energy must be evaluated at all."""
-        return "loss" in self.inputs or "gradient" in self.inputs
+        return bool(self.neighbours) or "loss" in self.inputs or "gradient" in self.inputs
 
 
-#: For a CPU: half the resolution in blocks, a field of view of about 100 pixels, neighbours at two distances.
+#: For a CPU: every second pixel, a field of view of about 100 pixels, neighbours at two distances. What it sees has no
+#: scale and no colour of its own, so that it carries over to other cameras.
 COMPACT = RefinerConfig(
-    inputs=("state", "loss", "gradient", "deviation", "image"),
+    inputs=("loss", "gradient", "deviation"),
     layers=((32, 1), (32, 2), (32, 4), (32, 8), (32, 1)),
     divisor=2,
-    propagation=(2, 8),
+    neighbours=(2, 8),
     detached=True,
 )
+
+
+class View(NamedTuple):
+    """What G looks at, beside the batch."""
+
+    state: Tensor
+    """(B, 5, H, W), pixels."""
+    loss: Tensor | None = None
+    """(B, H, W): the energy's map."""
+    gradient: Tensor | None = None
+    """(B, 5, H, W): of the energy."""
+    camera_loss: Tensor | None = None
+    """(B, H, W): the energy's map if everything followed the camera's motion."""
+    contrasts: Tensor | None = None
+    """(B, k, h, w): of left1, between neighbours."""
 
 
 class Update(NamedTuple):
@@ -89,104 +109,130 @@ class Update(NamedTuple):
     change: Tensor
     """(B, 5, H, W), to be added, in pixels."""
     reliability: Tensor | None
-    """(B, 2, h, w): logits of the state's disparity and motion being right, at each block; with propagation only."""
+    """(B, 2, h, w): logits of the state's disparity and motion being right, at each block; with neighbours only."""
 
 
 class Refiner(nn.Module):
-    """G. Its last layer starts at zero: untrained, it changes nothing."""
+    """G. Its last layers start at zero: untrained, it changes nothing."""
 
     def __init__(self, config: RefinerConfig | None = None) -> None:
         super().__init__()
         self.config = config = config or RefinerConfig()
-        block = config.divisor**2
-        channels, layers = config.channels * block, []
+        self.grid = Grid(config.divisor)
+        channels, layers = config.channels, []
         for width, dilation in config.layers:
             layers += [nn.Conv2d(channels, width, 3, padding=dilation, dilation=dilation), nn.ReLU(inplace=True)]
             channels = width
         self.hidden = nn.Sequential(*layers)
-        self.correction = nn.Conv2d(channels, 5 * block, 3, padding=1)
+        self.correction = nn.Conv2d(channels, 5, 3, padding=1)
         for module in self.hidden:
             if isinstance(module, nn.Conv2d):
                 nn.init.kaiming_normal_(module.weight, nonlinearity="relu")
                 nn.init.zeros_(module.bias)  # type: ignore[arg-type]
-        nn.init.zeros_(self.correction.weight)
-        nn.init.zeros_(self.correction.bias)  # type: ignore[arg-type]
-        self.propagation = Propagation(channels, config.divisor, config.propagation) if config.propagation else None
+        heads: list[nn.Conv2d] = [self.correction]
+        if config.neighbours:
+            self.neighbours = Neighbours(config.neighbours)
+            self.reliability = nn.Conv2d(channels, 2, 1)
+            self.preference = nn.Conv2d(channels, len(self.neighbours.offsets), 1)
+            self.gates = nn.Conv2d(channels, _GATES * config.divisor**2, 1)
+            self.edge_sharpness = nn.Parameter(torch.tensor(_EDGE_SHARPNESS))
+            heads += [self.reliability, self.preference, self.gates]
+        for layer in heads:
+            nn.init.zeros_(layer.weight)
+            nn.init.zeros_(layer.bias)  # type: ignore[arg-type]
 
-    def forward(
-        self,
-        state: Tensor,
-        loss: Tensor | None = None,
-        gradient: Tensor | None = None,
-        images: Tensor | None = None,
-        evidence: Tensor | None = None,
-    ) -> Update:
+    def contrasts(self, batch: Batch) -> Tensor | None:
+        """What the images say about neighbours, for `View`; the same in every step."""
+        return self.neighbours.contrasts(self.grid.pick(batch.images[:, 0])) if self.config.neighbours else None
+
+    def forward(self, view: View, batch: Batch) -> Update:
         """The update of a state.
 
         Parameters
         ----------
-        state : Tensor (B, 5, H, W)
-            X in pixels.
-        loss, gradient : Tensor (B, H, W) and (B, 5, H, W)
-            The energy's map and the gradient of its sum, if they are inputs.
-        images : Tensor (B, 6, H, W)
-            left1 and left2 in [0, 1], if they are an input or there is propagation.
-        evidence : Tensor (B, evidence, H, W)
-            In [0, 1], if it is an input.
+        view : View
+            Energy and gradient if they are inputs; camera_loss and contrasts with neighbours.
+        batch : Batch
+            Its images if they are an input, its evidence if that is one; with neighbours its backward flow and the camera's
+            motion (without it, the state's own).
         """
-        height, width = state.shape[-2:]
-        divisor = self.config.divisor
-        features = self._features(state, loss, gradient, images, evidence)
-        bottom, right = -height % divisor, -width % divisor
-        if bottom or right:
-            features = F.pad(features, (0, right, 0, bottom), mode="replicate")
-        x = self.hidden(F.pixel_unshuffle(features, divisor))
-        change = F.pixel_shuffle(self.correction(x).float(), divisor)[..., :height, :width]
-        if self.propagation is None:
-            return Update(change, None)
-        if images is None:
-            raise ValueError("this refiner propagates along the images' edges: it needs the images")
-        moved, reliability = self.propagation(x, state, images[:, :3])
-        return Update(change + moved, reliability)
+        state = view.state
+        size = state.shape[-2], state.shape[-1]
+        picked = self.grid.pick(state)
+        features = [self._input(name, view, picked, batch) for name in self.config.inputs]
+        if not self.config.neighbours:
+            correction = self.correction(self.hidden(torch.cat(features, 1))).float()
+            return Update(self.grid.spread(correction, size), None)
+        coordinates = self.grid.coordinates(picked)
+        residual, round_trip = second_pair(picked, coordinates, state[:, 1:2], _backward(batch, state))
+        camera = picked[:, 2:]
+        if batch.homography is not None:
+            camera = camera_motion(picked[:, 0], coordinates, batch.homography)
+        assert view.camera_loss is not None
+        assert view.loss is not None
+        assert view.contrasts is not None
+        rise = self._mean((view.camera_loss - view.loss)[:, None])
+        features += [_signed_log(maps) for maps in (camera - picked[:, 2:], residual, round_trip, rise)]
+        features += [_signed_log(self._within(state[:, channel : channel + 1], picked)) for channel in (0, 3)]
+        x = self.hidden(torch.cat(features, 1))
+        correction = _CORRECTION_MOST_PX * (self.correction(x).float() / _CORRECTION_MOST_PX).tanh()
+        reliability = self.reliability(x).float()
+        preference = self.preference(x).float() - self.edge_sharpness * view.contrasts
+        mixture = self.neighbours.mixture(picked, preference, reliability)
+        gates = F.pixel_shuffle(self.gates(x).float(), self.config.divisor)[..., : size[0], : size[1]].tanh()
+        values = torch.cat([mixture, camera, residual, correction], 1)
+        return Update(_change(state, self.grid.spread(values, size), gates), reliability)
 
-    def _features(
-        self,
-        state: Tensor,
-        loss: Tensor | None,
-        gradient: Tensor | None,
-        images: Tensor | None,
-        evidence: Tensor | None,
-    ) -> Tensor:
-        """All inputs, scaled, (B, channels, H, W)."""
-        given = {
-            "state": state,
-            "deviation": state,
-            "loss": loss,
-            "gradient": gradient,
-            "image": images,
-            "evidence": evidence,
-        }
-        parts = []
-        for name in self.config.inputs:
-            maps = given[name]
-            if maps is None:
-                raise ValueError(f"this refiner needs the input {name!r}")
-            parts.append(_SCALED[name](maps))
-        return torch.cat(parts, 1)
+    def _input(self, name: Input, view: View, picked: Tensor, batch: Batch) -> Tensor:
+        """An input (B, n, h, w), scaled."""
+        match name:
+            case "state":
+                return _STATE_SCALE * picked
+            case "deviation":
+                return _signed_log(_deviation(picked, max(_SURROUNDINGS_PX // self.config.divisor, 1)))
+            case "loss" if view.loss is not None:
+                return _LOSS_SCALE * self._mean(view.loss[:, None].clamp(max=_LOSS_MOST))
+            case "gradient" if view.gradient is not None:
+                return _GRADIENT_SCALE * self._mean(view.gradient.clamp(-_GRADIENT_MOST, _GRADIENT_MOST))
+            case "image":
+                return self.grid.pick(batch.images[:, (0, 2)].flatten(1, 2)) - 0.5
+            case "evidence" if batch.evidence is not None:
+                return self.grid.pick(batch.evidence) - 0.5
+        raise ValueError(f"this refiner needs the input {name!r}")
+
+    def _mean(self, maps: Tensor) -> Tensor:
+        """Mean over each block."""
+        return F.avg_pool2d(self.grid.pad(maps), self.config.divisor) if self.config.divisor > 1 else maps
+
+    def _within(self, maps: Tensor, picked: Tensor) -> Tensor:
+        """How the other pixels of a block differ from the one that stands for it."""
+        block = F.pixel_unshuffle(self.grid.pad(maps), self.config.divisor)
+        return block[:, :-1] - block[:, -1:]
 
 
-def _deviation(state: Tensor) -> Tensor:
+def _change(state: Tensor, values: Tensor, gates: Tensor) -> Tensor:
+    """What gates let in of each value, (B, 5, H, W)."""
+    mixture, camera, residual, correction = values.split((4, 3, 1, 5), 1)
+    d1, motion = state[:, :1], state[:, 2:]
+    near, far, motion_near, motion_camera, change_far = gates.split(1, 1)
+    mended = near * (mixture[:, :1] - d1) + far * residual
+    moved = motion_near * (mixture[:, 1:] - motion)
+    moved = moved + motion_camera * (camera - motion - moved)
+    moved = torch.cat([moved[:, :1] + change_far * residual, moved[:, 1:]], 1)
+    return torch.cat([mended, torch.zeros_like(d1), moved], 1) + correction
+
+
+def _backward(batch: Batch, state: Tensor) -> Tensor:
+    return -state[:, 3:] if batch.backward_flow is None else batch.backward_flow
+
+
+def _deviation(state: Tensor, side: int) -> Tensor:
     # of boxes, interpolated: a sliding mean costs as much as the convolutions
-    boxes = F.avg_pool2d(state, _SURROUNDINGS_PX, ceil_mode=True, count_include_pad=False)
-    mean = F.interpolate(boxes, state.shape[-2:], mode="bilinear", align_corners=False)
-    return _DEVIATION_SCALE * (state - mean).clamp(-_DEVIATION_MOST, _DEVIATION_MOST)
+    boxes = F.avg_pool2d(state, side, ceil_mode=True, count_include_pad=False)
+    return state - F.interpolate(boxes, state.shape[-2:], mode="bilinear", align_corners=False)
 
 
-_SCALED = {
-    "state": lambda state: _STATE_SCALE * state,
-    "deviation": _deviation,
-    "loss": lambda loss: _LOSS_SCALE * loss[:, None].clamp(max=_LOSS_MOST),
-    "gradient": lambda gradient: _GRADIENT_SCALE * gradient.clamp(-_GRADIENT_MOST, _GRADIENT_MOST),
-    "image": lambda images: images - 0.5,
-    "evidence": lambda evidence: evidence,
-}
+def _signed_log(maps: Tensor) -> Tensor:
+    """From a tenth of a pixel to a hundred in a range of about one."""
+    return 0.5 * (2 * maps).asinh()
+

@@ -20,6 +20,7 @@ import torch
 from torch import Tensor, nn
 
 from learned.batch import Batch
+from learned.feedforward import Precision, mixed_precision
 from learned.hybrid import Watch, refine
 from learned.oracle import Oracle
 from learned.refiner import Refiner
@@ -42,6 +43,8 @@ class StrategyConfig:
     """Adam's step on the state in pixels."""
     parameters_rate: float = 1e-5
     """Adam's step on the weights; larger ones unlearn what training has taught."""
+    precision: Precision = "float32"
+    """Of the refiner's convolutions, see `learned.feedforward`."""
 
     def __post_init__(self) -> None:
         if self.steps < 0 or not (self.outputs_rate > 0 and self.parameters_rate > 0):
@@ -101,7 +104,7 @@ def apply_strategy(
     if config.strategy == "learned":
         if refiner is None:
             raise ValueError("the learned strategy needs a refiner")
-        with torch.inference_mode():
+        with torch.inference_mode(), mixed_precision(config.precision, batch.images.device):
             states = refine(refiner, batch, oracle, steps, watch).states
     elif config.strategy == "outputs":
         states = [batch.start, descend_outputs(batch.start, oracle, steps, config.outputs_rate, watch)]

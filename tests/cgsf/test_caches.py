@@ -9,6 +9,7 @@ import pytest
 import torch
 from click.testing import CliRunner, Result
 
+from cgsf.camera_motion import find_homography
 from cgsf.cli import main
 from cgsf.intake import to_frames
 from cgsf.sample_cache import SampleCache
@@ -82,16 +83,16 @@ def test_starts_of_the_networks_go_on(tmp_path: Path, frames: Path, monkeypatch:
         patch.setattr("cgsf.start_cache.make_start", _stopped_after(2))
         assert isinstance(call(*arguments).exception, ZeroDivisionError)
     assert len(StartCache(tmp_path / "s")) == 2
-    first = np.array(StartCache(tmp_path / "s")[0][0])
+    first = np.array(StartCache(tmp_path / "s")[0]["start"])
     assert call(*arguments).output.splitlines()[-1].endswith("3 starts")
     starts, cache = StartCache(tmp_path / "s"), SampleCache(tmp_path / "c")
     assert starts.names == cache.names
-    np.testing.assert_array_equal(starts[0][0], first)
+    np.testing.assert_array_equal(starts[0]["start"], first)
     config = load_start_config("feedforward", disparity=disparity, motion=motion)
     expected = make_start(to_frames(list(cache[2][0])), config)
-    np.testing.assert_array_equal(starts[2][0], expected.state())
-    np.testing.assert_array_equal(starts[2][1], expected.backward_flow.transpose(2, 0, 1))
-    np.testing.assert_array_equal(starts[2][2][1], expected.visible)
+    np.testing.assert_array_equal(starts[2]["start"], expected.state())
+    np.testing.assert_array_equal(starts[2]["backward"], expected.backward_flow.transpose(2, 0, 1))
+    np.testing.assert_array_equal(starts[2]["evidence"][1], expected.visible)
     weights(tmp_path, seed=1)  # files of the same name, other weights
     assert "made otherwise" in call(*arguments).stderr
     assert not np.array_equal(make_start(to_frames(list(cache[2][0])), config).state(), expected.state())
@@ -113,10 +114,11 @@ def test_starts_of_other_methods(tmp_path: Path, frames: Path, initial: str):
     call("samples", "-o", tmp_path / "c", "--dataset", "frames", "--root", frames, "--size", "64x96", "--count", 1)
     made = call("starts", "-o", tmp_path / "s", "--cache", tmp_path / "c", "--initial", initial)
     assert made.exit_code == 0, made.output
-    state, backward, evidence = StartCache(tmp_path / "s")[0]
+    state, backward, evidence, homography = StartCache(tmp_path / "s")[0].values()
     assert np.abs(np.median(state[3:], (1, 2)) - scenes.FLOW).max() < 0.5
     assert np.abs(np.median(backward, (1, 2)) + scenes.FLOW).max() < 0.5
     assert 0 <= evidence.min() <= evidence.max() <= 1
+    np.testing.assert_allclose(homography, find_homography(state, backward.transpose(1, 2, 0)))
 
 
 def test_refusals_are_one_line(tmp_path: Path, frames: Path, monkeypatch: pytest.MonkeyPatch):

@@ -30,7 +30,7 @@ VIDEO = {"count": 2, "frames": 3, "height": 32, "width": 48, "antialias": False,
 def preset(tmp_path: Path) -> str:
     disparity, motion = weights(tmp_path)
     torch.manual_seed(1)
-    small = dataclasses.replace(COMPACT, layers=((8, 1),), propagation=(1,))
+    small = dataclasses.replace(COMPACT, layers=((8, 1),), neighbours=(1,))
     save(Refiner(small), tmp_path / "r.safetensors", ModelCard("a test"))
     text = f'[feedforward]\ndisparity = "{disparity}"\nmotion = "{motion}"\n[refined]\nrefiner = "{tmp_path}/r.safetensors"\n'
     (tmp_path / "preset.toml").write_text(text + "parameters_rate = 1e-3\n")

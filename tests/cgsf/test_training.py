@@ -35,7 +35,7 @@ from variational.energy import EnergyConfig
 ROOT = Path(__file__).parents[2]
 SIZE = (64, 96)
 NAMES = [f"plane-{i}" for i in range(4)]
-SMALL_REFINER = dataclasses.replace(COMPACT, layers=((8, 1),), propagation=(1,), steps=2)
+SMALL_REFINER = dataclasses.replace(COMPACT, layers=((8, 1),), neighbours=(1,), steps=2)
 
 
 def make(index: int) -> Sample:
@@ -91,7 +91,7 @@ def test_a_cache_is_continued_where_it_stopped(tmp_path):
 
 def test_starts_are_those_of_the_method(folder):
     starts, cache = StartCache(folder / "starts"), SampleCache(folder / "cache")
-    state, backward, evidence = starts[1]
+    state, backward, evidence, _ = starts[1].values()
     result = pipelines.solve(list(cache[1][0]), "variational", pipelines.load_config("variational"))
     np.testing.assert_array_equal(state, result.state())
     np.testing.assert_array_equal(backward, result.backward_flow.transpose(2, 0, 1))
@@ -300,7 +300,27 @@ def test_shipped_recipes_fit_the_shipped_networks():
     assert [read_recipe(name).stage for name in names] == ["flow", "disparity", "joint", "refiner", "refiner"]
     assert read_recipe("self-supervised").supervision == "energy"
     for name in (*names[2:], "self-supervised"):
-        assert dataclasses.replace(read_recipe(name).refiner, steps=COMPACT.steps) == COMPACT
+        refiner = read_recipe(name).refiner
+        assert dataclasses.replace(refiner, steps=COMPACT.steps, inputs=COMPACT.inputs, evidence=0) == COMPACT
+        assert set(COMPACT.inputs) <= set(refiner.inputs)
+
+
+def test_steps_before_lead_to_other_starts(folder):
+    """The refiner learns from what it has made of a start, not from the start alone."""
+    from cgsf.stages import STAGES
+    from cgsf.training import Batches
+
+    settings = recipe(folder, "refiner", steps_before=3)
+    batch = Batches(settings, SampleCache(folder / "cache"), StartCache(folder / "starts"))(0)
+    model = STAGES["refiner"].network(settings)
+    with torch.no_grad():
+        model.correction.bias.fill_(0.5)
+    begun = set()
+    for seed in range(12):
+        torch.manual_seed(seed)
+        _, numbers = STAGES["refiner"].loss(settings, model, batch)
+        begun.add(round(numbers["start"], 4))
+    assert len(begun) == 4
 
 
 def test_one_shuffled_pass_sees_every_sample_once(folder):

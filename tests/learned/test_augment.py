@@ -7,6 +7,7 @@ import torch
 
 from learned.augment import AugmentConfig, augment, resized
 from learned.batch import Batch
+from learned.hybrid import still
 
 PLAIN = AugmentConfig(40, 56, zoom=0, stretch=0, flip=False, colour=0, noise=0, erase=0)
 
@@ -17,7 +18,7 @@ def batch() -> Batch:
     y, x = torch.meshgrid(torch.arange(60.0), torch.arange(80.0), indexing="ij")
     image = torch.stack([x / 80, y / 60, torch.full_like(x, 0.5)])
     truth = torch.stack([x / 8, y / 6, x - 40, y / 3, x / 5])[None]
-    return Batch(image.expand(1, 4, 3, 60, 80).clone(), truth, truth + 1, truth[:, 3:], truth[:, :1], ("a",))
+    return Batch(image.expand(1, 4, 3, 60, 80).clone(), truth, truth + 1, truth[:, 3:], truth[:, :1], names=("a",))
 
 
 def generator(seed: int = 0) -> torch.Generator:
@@ -85,3 +86,22 @@ def test_bytes_become_unit_range(batch: Batch):
 def test_a_sample_that_is_too_small_is_refused(batch: Batch):
     with pytest.raises(ValueError, match="smaller than the crop"):
         augment(batch, AugmentConfig(100, 50), generator())
+
+
+def test_the_cameras_motion_follows_every_change_of_coordinates():
+    """What the homography predicts is changed as a truth of the same motion is, by crop, zoom and mirror."""
+    homography = torch.eye(4, dtype=torch.float64)[None] + 2e-3 * torch.randn(1, 4, 4, generator=generator(4)).double()
+    homography[0, :, 3] += torch.tensor([2.0, -1.5, 0.7, 0.0])
+    disparity = 5 + 10 * torch.rand(1, 64, 96, generator=generator(5))
+    truth = still(torch.stack([disparity] * 5, 1), homography)
+    sample = Batch(torch.rand(1, 4, 3, 64, 96, generator=generator(6)), truth, homography=homography)
+    for seed in range(6):
+        config = AugmentConfig(48, 64, zoom=0.5 if seed > 2 else 0, stretch=0.2 if seed > 2 else 0, colour=0, noise=0, erase=0)
+        changed = augment(sample, config, generator(seed))
+        predicted = still(changed.truth, changed.homography)
+        # a resized truth is its nearest pixel's: off by what the motion changes within half a pixel, but not on average
+        difference = predicted - changed.truth
+        assert difference.abs().max() < (0.3 if seed > 2 else 1e-3)
+        assert difference.mean((0, 2, 3)).abs().max() < 2e-3
+    both = Batch.cat([sample, changed := augment(sample, AugmentConfig(64, 96, zoom=0, stretch=0), generator(9))])
+    assert torch.equal(both[1].homography, changed.homography)

@@ -1,17 +1,17 @@
-"""The refiner, its propagation and the loop over steps."""
+"""The refiner, what it may take over, and the loop over steps."""
 
 import dataclasses
 
 import pytest
 import torch
 
+from learned.alternatives import Grid, Neighbours, camera_motion, reliability_loss, second_pair
 from learned.batch import Batch
 from learned.hybrid import Hybrid, refine
 from learned.oracle import Oracle
-from learned.propagation import Propagation, reliability_loss
-from learned.refiner import COMPACT, Refiner, RefinerConfig
+from learned.refiner import COMPACT, Refiner, RefinerConfig, View, _change
 
-SMALL = dataclasses.replace(COMPACT, layers=((8, 1), (8, 2)), propagation=(1, 3), steps=3)
+SMALL = dataclasses.replace(COMPACT, layers=((8, 1), (8, 2)), neighbours=(1, 3), steps=3)
 HEIGHT, WIDTH = 37, 51
 
 
@@ -51,11 +51,13 @@ def test_only_the_chosen_inputs_matter(batch: Batch, inputs: tuple[str, ...]):
     refiner = shaken(Refiner(RefinerConfig(inputs=inputs, layers=((8, 1),))))
     generator = torch.Generator().manual_seed(1)
     loss, gradient = torch.rand(2, HEIGHT, WIDTH, generator=generator), torch.randn(batch.start.shape, generator=generator)
-    given = {"state": batch.start, "loss": loss, "gradient": gradient, "images": batch.images[:, (0, 2)].flatten(1, 2)}
-    plain = refiner(**given).change
-    for name in given:
-        changed = refiner(**(given | {name: given[name] + 0.5})).change
-        assert torch.equal(plain, changed) == ({"images": "image"}.get(name, name) not in inputs)
+    view = View(batch.start, loss, gradient)
+    plain = refiner(view, batch).change
+    for name in ("state", "loss", "gradient"):
+        changed = refiner(view._replace(**{name: getattr(view, name) + 0.5}), batch).change
+        assert torch.equal(plain, changed) == (name not in inputs)
+    changed = refiner(view, dataclasses.replace(batch, images=batch.images + 0.5)).change
+    assert torch.equal(plain, changed) == ("image" not in inputs)
 
 
 def test_energy_is_not_evaluated_without_need(batch: Batch):
@@ -67,41 +69,104 @@ def test_energy_is_not_evaluated_without_need(batch: Batch):
     assert len(refine(Refiner(config), batch, Forbidden()).states) == 3
 
 
-def test_blocks_keep_every_pixel(batch: Batch):
-    """A unit change in one pixel reaches the output within the field of view and nowhere else, also at odd sizes."""
+def test_every_pixel_of_a_block_gets_its_change():
+    """Odd sizes too; what a block's pixel says stays within the field of view."""
+    state = torch.zeros(1, 5, HEIGHT, WIDTH)
+    empty = Batch(torch.zeros(1, 4, 3, HEIGHT, WIDTH))
     refiner = shaken(Refiner(RefinerConfig(inputs=("state",), layers=((8, 1),), divisor=2)))
-    touched = batch.start.clone()
+    touched = state.clone()
     touched[0, 0, HEIGHT - 1, WIDTH - 1] += 1
-    difference = (refiner(touched).change - refiner(batch.start).change).abs().sum(1)
+    difference = (refiner(View(touched), empty).change - refiner(View(state), empty).change).abs().sum(1)
+    assert difference.shape == (1, HEIGHT, WIDTH)
     assert difference[0, HEIGHT - 1, WIDTH - 1] > 0
     assert difference[0, : HEIGHT - 7].max() == 0
-    assert difference[1].max() == 0
 
 
-def test_propagation_takes_over_the_reliable_neighbour():
-    """A wrong pixel amid good ones gets their value when the gate is open and its surroundings are trusted."""
-    propagation = Propagation(4, 1, (1,))
-    torch.nn.init.constant_(propagation.gates.bias, 20.0)  # tanh = 1
+def test_grid_picks_the_last_pixel_of_each_block():
+    maps, grid = torch.arange(5 * 7.0).reshape(1, 1, 5, 7), Grid(2)
+    picked = grid.pick(maps)
+    columns, rows = grid.coordinates(picked)
+    assert torch.equal(columns, torch.tensor([1.0, 3, 5, 7]))
+    assert torch.equal(rows[:, 0], torch.tensor([1.0, 3, 5]))
+    assert torch.equal(picked[0, 0, :2, :3], 7 * rows[:2] + columns[:3])
+    assert torch.equal(picked[0, 0, 2], torch.tensor([29.0, 31, 33, 34]))  # the border's values repeat
+    assert torch.equal(grid.spread(picked, (5, 7))[0, 0, :2, :2], torch.full((2, 2), 8.0))
+
+
+def test_neighbours_that_are_trusted_outvote_a_wrong_pixel():
     state = torch.full((1, 5, 9, 9), 7.0)
     state[0, :, 4, 4] = 90.0
-    change, reliability = propagation(torch.zeros(1, 4, 9, 9), state, torch.full((1, 3, 9, 9), 0.5))
-    moved = state + change
-    assert reliability.shape == (1, 2, 9, 9)
-    assert torch.allclose(moved[0, (0, 2, 3, 4), 4, 4], torch.tensor(7.0))
-    assert moved[0, 1, 4, 4] == 90.0  # left2's grid is not touched
-    assert torch.allclose(moved[0, 0, 0, 0], torch.tensor(7.0))
+    neighbours = Neighbours((1,))
+    zero = torch.zeros(1, 8, 9, 9)
+    assert torch.allclose(neighbours.mixture(state, zero, torch.zeros(1, 2, 9, 9))[0, :, 4, 4], torch.tensor(7.0))
+    reliability = torch.zeros(1, 2, 9, 9)
+    reliability[0, 0, 4, 4] = -50.0  # of its disparity alone
+    mixture = neighbours.mixture(state, zero, reliability)
+    assert torch.allclose(mixture[0, 0], torch.tensor(7.0))
+    assert mixture[0, 1:, 4, 5].min() > 15
 
 
-def test_propagation_stops_at_edges():
-    propagation = Propagation(4, 1, (2,))
-    torch.nn.init.constant_(propagation.gates.bias, 20.0)
-    torch.nn.init.constant_(propagation.edge_sharpness, 200.0)
-    image, state = torch.zeros(1, 3, 12, 12), torch.zeros(1, 5, 12, 12)
-    image[..., 6:], state[..., 6:] = 1.0, 30.0
-    change, _ = propagation(torch.zeros(1, 4, 12, 12), state, image)
-    assert change.abs().max() < 1e-3
-    change, _ = propagation(torch.zeros(1, 4, 12, 12), state, torch.zeros_like(image))
-    assert change[:, 0].abs().max() > 5
+def test_contrasts_are_those_of_the_neighbours():
+    image = torch.zeros(1, 3, 12, 12)
+    image[..., 6:] = 1.0
+    contrasts = Neighbours((2,)).contrasts(image)
+    assert contrasts.shape == (1, 8, 12, 12)
+    assert contrasts[0, :, 5, 2].max() == 0
+    assert contrasts[0, :, 5, 5].sum() == 3  # the three on the right
+
+
+def test_camera_motion_of_a_turn_and_a_step():
+    """A homography that adds to x and y and scales the disparity, at asymmetric sizes and picked pixels."""
+    homography = torch.eye(4, dtype=torch.float64)[None]
+    homography[0, 0, 3], homography[0, 1, 3], homography[0, 2, 2] = 3.0, -2.0, 1.25
+    change, u, v = camera_motion(torch.full((1, 4, 6), 8.0), Grid(2).coordinates(torch.empty(4, 6)), homography)[0]
+    assert torch.allclose(change, torch.tensor(2.0))
+    assert torch.allclose(u, torch.tensor(3.0))
+    assert torch.allclose(v, torch.tensor(-2.0))
+    homography[0, 3, 3] = 2.0  # everything twice as far from the origin's projection
+    x, y = Grid(1).coordinates(torch.empty(4, 6))
+    _, u, v = camera_motion(torch.full((1, 4, 6), 8.0), (x, y), homography)[0]
+    assert torch.allclose(u, ((x + 3) / 2 - x).expand(4, 6))
+    assert torch.allclose(v, ((y - 2) / 2 - y).expand(4, 6))
+
+
+def test_second_pair_is_looked_up_where_the_flow_leads_to():
+    y, x = torch.meshgrid(torch.arange(10.0), torch.arange(14.0), indexing="ij")
+    d2, backward = (x + 10 * y)[None, None], torch.stack([-x / 7, y / 5])[None]
+    state = torch.tensor([4.0, 0, 2, 3, -1])[:, None, None].expand(5, 10, 14)
+    grid = Grid(2)
+    residual, round_trip = second_pair(grid.pick(state[None]), grid.coordinates(torch.empty(5, 7)), d2, backward)
+    assert residual[0, 0, 1, 2] == pytest.approx(5 + 3 + 10 * (3 - 1) - 4 - 2, abs=1e-4)
+    assert round_trip[0, 0, 1, 2] == pytest.approx(((3 - 8 / 7) ** 2 + (-1 + 2 / 5) ** 2) ** 0.5, abs=1e-5)
+
+
+@pytest.mark.parametrize(("gate", "expected"), [(0, [7, 0, 0, 0]), (1, [20, 0, 0, 0]), (2, [0, 1, 2, 3]), (3, [0, 4, 5, 6]),
+                                                (4, [0, 20, 0, 0])])  # fmt: skip
+def test_each_gate_lets_in_one_alternative(gate: int, expected: list[float]):
+    values = torch.tensor([7.0, 1, 2, 3, 4, 5, 6, 20, 0, 0, 0, 0, 0])[None, :, None, None]
+    gates = torch.zeros(1, 5, 1, 1)
+    gates[:, gate] = 1
+    change = _change(torch.zeros(1, 5, 1, 1), values, gates)[0, :, 0, 0]
+    assert change[1] == 0
+    assert torch.equal(change[[0, 2, 3, 4]], torch.tensor(expected, dtype=torch.float32))
+
+
+def test_both_motions_at_once_do_not_add_up():
+    """Neighbours and camera agree on a value: a pixel that trusts both gets it once."""
+    values = torch.tensor([0.0, 5, 5, 5, 5, 5, 5, 0, 0, 0, 0, 0, 0])[None, :, None, None]
+    change = _change(torch.zeros(1, 5, 1, 1), values, torch.tensor([0.0, 0, 1, 1, 0])[None, :, None, None])
+    assert torch.equal(change[0, 2:, 0, 0], torch.full((3,), 5.0))
+
+
+def test_the_cameras_energy_is_looked_at(batch: Batch):
+    """A camera that explains the motion is told apart from one that does not."""
+    refiner = shaken(Refiner(SMALL))
+    moved = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
+    moved[:, 0, 3] = 5.0
+    still = torch.eye(4, dtype=torch.float64).expand(2, 4, 4)
+    states = [refine(refiner, dataclasses.replace(batch, homography=motion)).states[1] for motion in (None, still, moved)]
+    assert not torch.allclose(states[1], states[2])
+    assert not torch.allclose(states[0], states[1])
 
 
 def test_reliability_loss_ignores_unknown_truth():
@@ -140,7 +205,7 @@ def test_hybrid_is_networks_then_refiner(batch: Batch):
 
 
 @pytest.mark.parametrize("wrong", [{"inputs": ()}, {"inputs": ("state", "colour")}, {"inputs": ("state", "state")},
-                                   {"evidence": 2}, {"divisor": 0}, {"layers": ()}, {"propagation": (0,)}])  # fmt: skip
+                                   {"evidence": 2}, {"divisor": 0}, {"layers": ()}, {"neighbours": (0,)}])  # fmt: skip
 def test_impossible_configurations_are_refused(wrong: dict):
     with pytest.raises(ValueError, match="must"):
         RefinerConfig(**wrong)
@@ -148,4 +213,4 @@ def test_impossible_configurations_are_refused(wrong: dict):
 
 def test_missing_input_is_named(batch: Batch):
     with pytest.raises(ValueError, match="'loss'"):
-        Refiner(RefinerConfig(layers=((8, 1),)))(batch.start)
+        Refiner(RefinerConfig(layers=((8, 1),)))(View(batch.start), batch)
