@@ -21,7 +21,7 @@ def random_problem(count: int, height: int, width: int) -> tuple[np.ndarray, np.
 def test_a_chain_equals_the_best_of_all_labellings() -> None:
     candidates, costs, price = random_problem(3, 6, 5)
     best = np.empty_like(costs)
-    _chains(candidates, costs, price, np.float32(1 / 10), best)
+    _chains(0, costs.shape[2], candidates, costs, price, np.float32(1 / 10), best)
     for x in range(5):
         expected = naive_matching.chain_minimum(candidates[..., x], costs[..., x], price[:, x], 10)
         difference = best[..., x] - expected
