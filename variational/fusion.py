@@ -182,8 +182,13 @@ def _transposed(planes: np.ndarray) -> np.ndarray:
     """(..., W, H) copy of (..., H, W) planes."""
     height, width = planes.shape[-2:]
     turned = np.empty((*planes.shape[:-2], width, height), planes.dtype)
-    for plane, out in zip(planes.reshape(-1, height, width), turned.reshape(-1, width, height), strict=True):
-        cv2.transpose(plane, dst=out)
+    flat, flat_turned = planes.reshape(-1, height, width), turned.reshape(-1, width, height)
+
+    def turn(first: int, last: int) -> None:
+        for k in range(first, last):
+            cv2.transpose(flat[k], dst=flat_turned[k])
+
+    over_bands(turn, range(len(flat) + 1))
     return turned
 
 
@@ -231,9 +236,13 @@ def motion_costs(
     costs = np.empty((len(candidates), *disparity.shape), np.float32)
     largest, outside = np.float32(config.truncation * BITS), np.float32(config.outside_cost)
     over_rows(_costs, len(disparity), candidates, disparity, *words, largest, outside, costs)
-    exists = np.isfinite(candidates[:, 1])
-    for k in range(len(costs)):
-        costs[k] = np.where(exists[k], cv2.blur(np.minimum(costs[k], 1), (config.window, config.window)), FORBIDDEN)
+
+    def average(first: int, last: int) -> None:
+        for k in range(first, last):
+            exists = np.isfinite(candidates[k, 1])
+            costs[k] = np.where(exists, cv2.blur(np.minimum(costs[k], 1), (config.window, config.window)), FORBIDDEN)
+
+    over_bands(average, range(len(costs) + 1))
     return costs
 
 

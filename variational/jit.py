@@ -39,11 +39,11 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from numba import config, get_num_threads, njit, types
+from numba import config, get_num_threads, njit, set_num_threads, types
 from numba.core.compiler import CompilerBase, DefaultPassBuilder
 from numba.extending import overload
 
-__all__ = ["band_edges", "inlined", "over_bands", "over_rows", "rowwise", "scalar", "total"]
+__all__ = ["band_edges", "inlined", "over_bands", "over_rows", "rowwise", "scalar", "side_by_side", "total"]
 
 MIN_BAND_ROWS = 24
 """Rows below which a band is not worth its halo: the stencils recompute two rows on either side."""
@@ -80,7 +80,7 @@ def _real(number, like):  # type: ignore[no-untyped-def]  # numba matches bare n
 
 @lru_cache(maxsize=1)
 def _pool() -> ThreadPoolExecutor:
-    """The helpers beside the calling thread. They run nothing but kernels, so that none ever waits for another."""
+    """The helpers beside the calling thread. None ever waits for another: bands are not cut into bands."""
     return ThreadPoolExecutor(max(1, config.NUMBA_NUM_THREADS - 1), thread_name_prefix="kernels")
 
 
@@ -108,7 +108,7 @@ def over_bands(kernel: Callable[..., None], edges: Sequence[int], *arguments: An
     Parameters
     ----------
     kernel : callable
-        A ``@rowwise`` kernel; no two bands write to the same place.
+        A ``@rowwise`` kernel, or a function that spends its time in numpy or OpenCV; no two bands write to the same place.
     edges : sequence of int
         Ascending, at least two.
     *arguments
@@ -125,6 +125,19 @@ def over_bands(kernel: Callable[..., None], edges: Sequence[int], *arguments: An
     for helper in helpers:
         if not helper.cancel():  # one that has not begun would find nothing left
             helper.result()
+
+
+def side_by_side(*tasks: Callable[[], Any]) -> list[Any]:
+    """Results of functions that do not depend on one another, run at the same time on as many threads as numba may use.
+
+    For whole stages, whose serial parts then fill one another's waits. They share the threads out among them.
+    """
+    threads = get_num_threads()
+    if threads == 1:
+        return [task() for task in tasks]
+    share = max(1, threads // len(tasks))
+    with ThreadPoolExecutor(threads, "stages", initializer=set_num_threads, initargs=(share,)) as stages:
+        return list(stages.map(lambda task: task(), tasks))
 
 
 def total(values: np.ndarray) -> float:

@@ -13,9 +13,9 @@ from variational.camera import StereoCamera
 from variational.evidence import EvidenceConfig, refill
 from variational.fusion import FusionConfig, choose, motion_costs
 from variational.initialise import Start, sample
-from variational.jit import over_rows, rowwise
+from variational.jit import over_rows, rowwise, side_by_side
 from variational.matching import MatchingConfig
-from variational.objects import ObjectsConfig, find_objects, unexplained_surfaces
+from variational.objects import ObjectsConfig, find_landmarks, find_objects, unexplained_surfaces
 from variational.rigid import Correspondences, RigidConfig, RigidMotion, displacements, find_motions, guess_camera
 from variational.state import D1, C, flow_of
 from variational.visibility import project_visibility
@@ -137,9 +137,13 @@ def propose(
     -------
     Proposal
     """
-    matches = correspondences(start)
-    camera = camera or guess_camera(matches, rigid)
-    motions = find_motions(matches, camera, rigid)
+
+    def search() -> tuple[StereoCamera, list[RigidMotion]]:
+        matches = correspondences(start)
+        known = camera or guess_camera(matches, rigid)
+        return known, find_motions(matches, known, rigid)
+
+    (known, motions), landmarks2 = side_by_side(search, lambda: find_landmarks(grey2, objects))
     if not motions:
         return keep(start)
     words = (start.match1.words_left, start.match2.words_left, start.match2.words_right)
@@ -162,7 +166,7 @@ def propose(
     if not evidence.fill:
         return Proposal(state, labels, motions, cost)
     surfaces = unexplained_surfaces(state[D1], cost, project_visibility(state), objects)
-    motions += find_objects(start, state[D1], grey, grey2, surfaces, camera.projection(), objects)
+    motions += find_objects(start, state[D1], grey, landmarks2, surfaces, known.projection(), objects)
     homographies = np.stack([motion.homography for motion in motions])
     state[D1] = refill(start.match1, start.match2, grey, labels, homographies, matching, evidence)
     labels, cost = fuse()

@@ -7,15 +7,24 @@ of left2 the nearest, that of largest disparity, is seen.
 
 import numpy as np
 
-from variational.jit import over_rows, rowwise
+from variational.jit import over_rows, rowwise, scalar
 from variational.state import D1, C, U, V
 
 
+@scalar
+def _sources(first: int, last: int, height: int, up: float, down: float) -> tuple[int, int]:
+    """Rows from which something may land on rows `first` to `last`, if nothing moves farther `up` or `down`."""
+    return max(int(first - down) - 2, 0), min(int(last + up) + 2, height)
+
+
 @rowwise
-def _front(first: int, last: int, disparity: np.ndarray, u: np.ndarray, v: np.ndarray, front: np.ndarray) -> None:
+def _front(
+    first: int, last: int, disparity: np.ndarray, u: np.ndarray, v: np.ndarray, up: float, down: float, front: np.ndarray
+) -> None:
     """front (H, W): largest disparity landing on each pixel of left2 and its direct neighbours, -1 where none lands."""
     height, width = disparity.shape
-    for y in range(height):
+    begin, end = _sources(first, last, height, up, down)
+    for y in range(begin, end):
         for x in range(width):
             to_y = int(np.floor(y + v[y, x]))
             if to_y + 1 < first or to_y >= last:
@@ -42,8 +51,14 @@ def _seen(
 
 def _front_of(state: np.ndarray) -> np.ndarray:
     front = np.full(state.shape[1:], -1, np.float32)
-    over_rows(_front, len(front), np.maximum(state[D1] + state[C], 0), state[U], state[V], front)
+    over_rows(_front, len(front), np.maximum(state[D1] + state[C], 0), state[U], state[V], *_reach(state), front)
     return front
+
+
+def _reach(state: np.ndarray) -> tuple[float, float]:
+    """How far pixels move up and down at the most, within the image's height."""
+    height = state.shape[1]
+    return float(np.clip(-state[V].min(), 0, height)), float(np.clip(state[V].max(), 0, height))
 
 
 def project_visibility(state: np.ndarray, margin_px: float = 1.5) -> np.ndarray:
@@ -69,11 +84,12 @@ def project_visibility(state: np.ndarray, margin_px: float = 1.5) -> np.ndarray:
 
 @rowwise
 def _backward(
-    first: int, last: int, disparity: np.ndarray, u: np.ndarray, v: np.ndarray, front: np.ndarray, margin: float,
-    best: np.ndarray, backward: np.ndarray,
+    first: int, last: int, disparity: np.ndarray, u: np.ndarray, v: np.ndarray, up: float, down: float,
+    front: np.ndarray, margin: float, best: np.ndarray, backward: np.ndarray,
 ) -> None:  # fmt: skip
     height, width = disparity.shape
-    for y in range(height):
+    begin, end = _sources(first, last, height, up, down)
+    for y in range(begin, end):
         for x in range(width):
             at_y = y + v[y, x]
             to_y = int(np.rint(at_y))
@@ -108,5 +124,5 @@ def backward_flow(state: np.ndarray, fallback: np.ndarray, margin_px: float = 1.
     best = np.full(state.shape[1:], np.inf, np.float32)
     disparity = np.maximum(state[D1] + state[C], 0)
     front, margin = _front_of(state), np.float32(margin_px)
-    over_rows(_backward, len(best), disparity, state[U], state[V], front, margin, best, backward)
+    over_rows(_backward, len(best), disparity, state[U], state[V], *_reach(state), front, margin, best, backward)
     return backward

@@ -76,10 +76,10 @@ def test_the_true_motion_is_chosen_and_outside_costs_a_constant() -> None:
     assert (labels[8:-8, 8:-10] == 0).mean() > 0.99
 
 
-@pytest.mark.parametrize("margin", [0.5, 1.5])
-def test_projection_equals_its_plain_twin(margin: float) -> None:
+@pytest.mark.parametrize(("margin", "height", "spread_px"), [(0.5, 29, 3), (1.5, 29, 3), (1.0, 100, 3), (1.0, 100, 40)])
+def test_projection_equals_its_plain_twin(margin: float, height: int, spread_px: float) -> None:
     rng = np.random.default_rng(4)
-    state = rng.normal(0, 3, (5, 29, 37)).astype(np.float32)
+    state = rng.normal(0, spread_px, (5, height, 37)).astype(np.float32)
     state[0] = rng.uniform(0, 12, state[0].shape)
     kept = state.copy()
     np.testing.assert_array_equal(project_visibility(state, margin), naive_matching.visible(state, margin))
