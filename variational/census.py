@@ -11,7 +11,7 @@ import numpy as np
 from numba import types
 from numba.extending import intrinsic
 
-from variational.jit import parallel, prange, rowwise
+from variational.jit import over_rows, rowwise
 
 CENSUS_ROWS, CENSUS_COLUMNS = 3, 4
 """Half window of the census: 7 rows x 9 columns, 62 comparisons in one 64-bit word."""
@@ -41,17 +41,17 @@ def _join_halves(high: np.ndarray, low: np.ndarray, low_bits: int, words: np.nda
         words[x] = (np.uint64(high[x]) << np.uint64(low_bits)) | np.uint64(low[x])
 
 
-@parallel
-def _census(padded: np.ndarray, spacing: int, words: np.ndarray) -> None:
+@rowwise
+def _census(first: int, last: int, padded: np.ndarray, spacing: int, words: np.ndarray) -> None:
     """One neighbour after the other over a whole row: halves of words are as wide as the image's numbers, so that a
     comparison and a shift are one vector instruction each."""
-    height, width = words.shape
+    width, left = words.shape[1], CENSUS_COLUMNS * spacing
     columns = 2 * CENSUS_COLUMNS + 1
     neighbours = columns * (2 * CENSUS_ROWS + 1)
-    for y in prange(height):
-        left = CENSUS_COLUMNS * spacing
+    halves = np.empty((2, width), np.uint32)
+    for y in range(first, last):
         centre = padded[y + CENSUS_ROWS * spacing, left : left + width]
-        halves = np.zeros((2, width), np.uint32)
+        halves[:] = 0
         for n in range(neighbours):
             begin = n % columns * spacing
             _compare_row(centre, padded[y + n // columns * spacing, begin : begin + width], halves[n // 32])
@@ -75,7 +75,7 @@ def census(grey: np.ndarray) -> np.ndarray:
     for k, image in enumerate((grey, cv2.GaussianBlur(grey, (0, 0), 1.0))):
         rows, columns = (k + 1) * CENSUS_ROWS, (k + 1) * CENSUS_COLUMNS
         padded = cv2.copyMakeBorder(image, rows, rows, columns, columns, cv2.BORDER_REPLICATE)
-        _census(padded, k + 1, words[k])
+        over_rows(_census, len(grey), padded, k + 1, words[k])
     return words
 
 
@@ -95,10 +95,10 @@ def write_matching_costs(left: np.ndarray, right_mirrored: np.ndarray, x: int, c
     costs[reach:] = OUTSIDE_COST
 
 
-@parallel
-def _matching_costs(left: np.ndarray, right_mirrored: np.ndarray, costs: np.ndarray) -> None:
-    height, width, _ = costs.shape
-    for y in prange(height):
+@rowwise
+def _matching_costs(first: int, last: int, left: np.ndarray, right_mirrored: np.ndarray, costs: np.ndarray) -> None:
+    width = costs.shape[1]
+    for y in range(first, last):
         for x in range(width):
             write_matching_costs(left[:, y], right_mirrored[:, y], x, costs[y, x])
 
@@ -106,5 +106,5 @@ def _matching_costs(left: np.ndarray, right_mirrored: np.ndarray, costs: np.ndar
 def stereo_costs(words_left: np.ndarray, words_right: np.ndarray, disparities: int) -> np.ndarray:
     """Matching costs (H, W, disparities) uint8 of the left image's pixels, in differing census bits."""
     costs = np.empty((*words_left.shape[1:], disparities), np.uint8)
-    _matching_costs(words_left, np.ascontiguousarray(words_right[..., ::-1]), costs)
+    over_rows(_matching_costs, len(costs), words_left, np.ascontiguousarray(words_right[..., ::-1]), costs)
     return costs

@@ -11,7 +11,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from variational.frames import Frames
-from variational.jit import band_edges, parallel, prange, total
+from variational.jit import over_rows, rowwise, total
 from variational.state import check_state
 from variational.terms.coupling import coupling_band, scatter_band
 from variational.terms.photometric import padded_planes, photometric_band, window_overlap
@@ -70,48 +70,28 @@ class EnergyConfig:
             raise ValueError(f"EnergyConfig.ssim_share must be in [0, 1], got {self.ssim_share}")
 
 
-@parallel
-def _evaluate(state: np.ndarray, left1: np.ndarray, right1: np.ndarray, left2: np.ndarray, right2: np.ndarray,
-              left2_source: np.ndarray, edges1: np.ndarray, edges2: np.ndarray, backward: np.ndarray,
-              overlap_y: np.ndarray, overlap_x: np.ndarray, visible1: np.ndarray, visible2: np.ndarray,
-              find_visible: bool, visible: np.ndarray, weights: tuple[float, float, float, float], alpha: float,
-              eps_intensity: float,
-              eps_px: float, w1: float, w2: float, drop_outside: bool, bands: np.ndarray, loss: np.ndarray,
-              gradient: np.ndarray, index: np.ndarray, parts: np.ndarray, with_gradient: bool) -> None:
-    """Write every term to `loss` and `gradient`. Three sweeps: a stencil reads the visibility of other bands.
+@rowwise
+def _row_terms(first: int, last: int, state: np.ndarray, edges1: np.ndarray, edges2: np.ndarray, backward: np.ndarray,
+               find_visible: bool, visible: np.ndarray, w_coupling: float, w_smooth: float, eps_px: float, w1: float,
+               w2: float, loss: np.ndarray, gradient: np.ndarray, index: np.ndarray, parts: np.ndarray) -> None:
+    """Begin the map and the gradient with all that needs no other row of them: visibility, smoothness, coupling.
 
-    Terms of one row go strip by strip, so that the strip's map and gradient stay in the cache from term to term: at large
-    sizes memory is what a plain sweep a term would wait for.
+    They go strip by strip, so that the strip's map and gradient stay in the cache from term to term: at large sizes
+    memory is what a plain sweep a term would wait for.
     """
-    w_stereo, w_flow, w_coupling, w_smooth = weights
-    for band in prange(bands.size - 1):
-        first, last = bands[band], bands[band + 1]
-        for strip in range(first, last, STRIP_ROWS):
-            end = min(strip + STRIP_ROWS, last)
-            loss[strip:end] = 0
-            gradient[:, strip:end] = 0
-            if find_visible:
-                visible_band(state[3], state[4], backward, w1, w2, strip, end, visible)
-            if w_smooth > 0:
-                for channel in range(5):
-                    smoothness_band(state[channel], edges2 if channel == 1 else edges1, w_smooth, eps_px, strip, end,
-                                    loss, gradient[channel])
-            if w_coupling > 0:
-                coupling_band(state, state[1].reshape(-1), visible, w_coupling, eps_px, strip, end, loss, gradient,
-                              index, parts)
-        if w_stereo > 0:
-            photometric_band(left1, right1, state[0], None, -1.0, visible1, overlap_y, overlap_x, w_stereo, alpha,
-                             eps_intensity, drop_outside, first, last, loss, gradient[0], gradient[0], with_gradient)
-            photometric_band(left2, right2, state[1], None, -1.0, visible2, overlap_y, overlap_x, w_stereo, alpha,
-                             eps_intensity, drop_outside, first, last, loss, gradient[1], gradient[1], with_gradient)
-    if w_flow > 0:
-        for band in prange(bands.size - 1):
-            photometric_band(left1, left2_source, state[3], state[4], 1.0, visible, overlap_y, overlap_x, w_flow, alpha,
-                             eps_intensity, drop_outside, bands[band], bands[band + 1], loss, gradient[3], gradient[4],
-                             with_gradient)
-    if w_coupling > 0 and with_gradient:
-        for band in prange(bands.size - 1):
-            scatter_band(index, parts, bands[band], bands[band + 1], gradient[1].reshape(-1))
+    for strip in range(first, last, STRIP_ROWS):
+        end = min(strip + STRIP_ROWS, last)
+        loss[strip:end] = 0
+        gradient[:, strip:end] = 0
+        if find_visible:
+            visible_band(strip, end, state[3], state[4], backward, w1, w2, visible)
+        if w_smooth > 0:
+            for channel in range(5):
+                smoothness_band(strip, end, state[channel], edges2 if channel == 1 else edges1, w_smooth, eps_px, loss,
+                                gradient[channel])
+        if w_coupling > 0:
+            coupling_band(strip, end, state, state[1].reshape(-1), visible, w_coupling, eps_px, loss, gradient, index,
+                          parts)
 
 
 class Energy:
@@ -186,12 +166,27 @@ class Energy:
             if array.shape != wanted or array.dtype != state.dtype or not array.flags.c_contiguous:
                 raise ValueError(f"out must hold contiguous {state.dtype} arrays of shapes {shape} and {state.shape}")
         index, parts = np.empty(shape, np.int32), np.empty((3, *shape), state.dtype)  # of the coupling term
-        weights = (float(config.stereo_weight), float(config.flow_weight), float(config.coupling_weight),
-                   float(config.smoothness_weight))
-        _evaluate(state, *self._inputs(state.dtype), *self._visible, find_visible, mask, weights,
-                  float(config.ssim_share), float(config.charbonnier_intensity), float(config.charbonnier_px),
-                  float(config.visible_relative), float(config.visible_absolute), bool(config.drop_outside),
-                  band_edges(shape[0]), loss, gradient, index, parts, with_gradient)
+        left1, right1, left2, right2, left2_source, edges1, edges2, backward, *overlap = self._inputs(state.dtype)
+        w_coupling, options = float(config.coupling_weight), (float(config.ssim_share), float(config.charbonnier_intensity),
+                                                              bool(config.drop_outside))
+        over_rows(_row_terms, shape[0], state, edges1, edges2, backward, find_visible, mask, w_coupling,
+                  float(config.smoothness_weight), float(config.charbonnier_px), float(config.visible_relative),
+                  float(config.visible_absolute), loss, gradient, index, parts)
+
+        def photometric(weight: float, target: np.ndarray, source: np.ndarray, dx: int, sign: float, dy: int | None,
+                        seen: np.ndarray) -> None:
+            """Add the term of a target image and a source that channels `dx` and `dy` of the state lead to."""
+            moves = dy is not None
+            if weight > 0:
+                over_rows(photometric_band, shape[0], target, source, state[dx], state[dy if moves else dx], moves, sign,
+                          seen, *overlap, float(weight), *options, loss, gradient[dx], gradient[dy if moves else dx],
+                          with_gradient)
+
+        photometric(config.stereo_weight, left1, right1, 0, -1.0, None, self._visible[0])
+        photometric(config.stereo_weight, left2, right2, 1, -1.0, None, self._visible[1])
+        photometric(config.flow_weight, left1, left2_source, 3, 1.0, 4, mask)
+        if w_coupling > 0 and with_gradient:
+            over_rows(scatter_band, shape[0], index, parts, gradient[1].reshape(-1))
         return loss, gradient
 
     def _inputs(self, dtype: np.dtype) -> tuple[np.ndarray, ...]:

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 
 from variational.census import popcount, write_matching_costs
-from variational.jit import parallel, prange, rowwise, scalar
+from variational.jit import over_rows, rowwise, scalar
 from variational.matching import MatchingConfig, StereoMatch, aggregate
 
 
@@ -54,14 +54,14 @@ class EvidenceConfig:
     small_step: int = 100
 
 
-@parallel
-def _front(disparity: np.ndarray, matched: np.ndarray, front: np.ndarray) -> None:
+@rowwise
+def _front(first: int, last: int, disparity: np.ndarray, matched: np.ndarray, front: np.ndarray) -> None:
     """front (H, W + D): largest matched disparity that lands on each pixel of the right image, -1 where none does.
 
     From the image's right end, as the matching costs go through it; the last D columns lie outside.
     """
-    height, width = disparity.shape
-    for y in prange(height):
+    width = disparity.shape[1]
+    for y in range(first, last):
         front[y] = -1
         for x in range(width):
             if matched[y, x]:
@@ -118,17 +118,17 @@ def _add_evidence(
         row[d] = np.uint8(np.int32(cost if cost < most else most))
 
 
-@parallel
+@rowwise
 def _write_costs(
-    disparity: np.ndarray, matched: np.ndarray, front: np.ndarray, words_left1: np.ndarray, right1_mirrored: np.ndarray,
-    words_left2: np.ndarray, words_right2: np.ndarray, labels: np.ndarray, homographies: np.ndarray, anchor: float,
-    hidden: np.float32, contradicted: np.float32, time_weight: float, unknown: np.float32, pull: float,
-    pull_most: float, costs: np.ndarray,
+    first: int, last: int, disparity: np.ndarray, matched: np.ndarray, front: np.ndarray, words_left1: np.ndarray,
+    right1_mirrored: np.ndarray, words_left2: np.ndarray, words_right2: np.ndarray, labels: np.ndarray,
+    homographies: np.ndarray, anchor: float, hidden: np.float32, contradicted: np.float32, time_weight: float,
+    unknown: np.float32, pull: float, pull_most: float, costs: np.ndarray,
 ) -> None:  # fmt: skip
     """words_left2, words_right2: (2, H * W)."""
     height, width, disparities = costs.shape
     most, reach = np.float32(255), int(min(255 / anchor, disparities)) + 2
-    for y in prange(height):
+    for y in range(first, last):
         fy = np.float32(y)
         for x in range(width):
             row, known = costs[y, x], disparity[y, x]
@@ -177,10 +177,11 @@ def refill(
     f = np.float32
     costs = np.empty((*grey.shape, match1.max_disparity + 1), np.uint8)
     front = np.empty((grey.shape[0], grey.shape[1] + costs.shape[2]), f)
-    _front(match1.disparity, match1.matched, front)
-    _write_costs(
-        match1.disparity, match1.matched, front, match1.words_left, np.ascontiguousarray(match1.words_right[..., ::-1]),
-        match2.words_left.reshape(2, -1), match2.words_right.reshape(2, -1), labels.astype(np.int32), homographies.astype(f),
+    over_rows(_front, len(front), match1.disparity, match1.matched, front)
+    over_rows(
+        _write_costs, len(costs), match1.disparity, match1.matched, front, match1.words_left,
+        np.ascontiguousarray(match1.words_right[..., ::-1]), match2.words_left.reshape(2, -1),
+        match2.words_right.reshape(2, -1), labels.astype(np.int32), homographies.astype(f),
         f(config.anchor_per_px), f(config.hidden_cost), f(config.contradicted_cost), f(config.time_weight),
         f(config.unknown_cost), f(config.background_per_px), f(config.background_most), costs,
     )  # fmt: skip

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from variational.census import BITS, popcount
-from variational.jit import inlined, parallel, prange, rowwise
+from variational.jit import inlined, over_bands, over_rows, rowwise
 
 STRIP = 192
 """Columns that a chain works on at a time: their candidates and costs of two rows stay in the nearest cache, and what
@@ -55,13 +55,13 @@ class FusionConfig:
     object_prior: float = 0.1
 
 
-@parallel
+@rowwise
 def _costs(
-    candidates: np.ndarray, disparity: np.ndarray, words_left1: np.ndarray, words_left2: np.ndarray,
-    words_right2: np.ndarray, largest: float, outside: float, costs: np.ndarray,
+    first: int, last: int, candidates: np.ndarray, disparity: np.ndarray, words_left1: np.ndarray,
+    words_left2: np.ndarray, words_right2: np.ndarray, largest: float, outside: float, costs: np.ndarray,
 ) -> None:  # fmt: skip
     count, _, height, width = candidates.shape
-    for y in prange(height):
+    for y in range(first, last):
         for k in range(count):
             for x in range(width):
                 u, v = candidates[k, 1, y, x], candidates[k, 2, y, x]
@@ -105,7 +105,8 @@ def _pass_message(
     motion, motion_from (K, 3, X); before (K, X): costs of the chains that end in the row before.
     """
     count, _, width = motion.shape
-    least[:] = before[0]
+    for x in range(width):
+        least[x] = before[0, x]
     for k in range(1, count):
         for x in range(width):
             least[x] = min(least[x], before[k, x])
@@ -127,7 +128,8 @@ def _add_costs(costs: np.ndarray, message: np.ndarray, upwards: int, before: np.
         for x in range(message.size):
             out[x] += before[x]
     else:
-        out[:] = message
+        for x in range(message.size):
+            out[x] = message[x]
 
 
 @rowwise
@@ -140,53 +142,61 @@ def _take_strip(candidates: np.ndarray, y: int, begin: int, motion: np.ndarray) 
                 motion[k, i, x] = candidates[k, i, y, begin + x]
 
 
-@parallel
+@rowwise
 def _chains(
-    candidates: np.ndarray, costs: np.ndarray, price: np.ndarray, inverse_scale: float, out: np.ndarray
-) -> None:
+    first: int, last: int, candidates: np.ndarray, costs: np.ndarray, price: np.ndarray, inverse_scale: np.float32,
+    out: np.ndarray,
+) -> None:  # fmt: skip
     """out (K, H, W): for every label of every pixel, the least cost of its whole column that has this label there.
 
-    price (H, W): full price between a pixel and the one above it. Exact: dynamic programming down and up, for a strip
-    of columns at a time.
+    Columns `first` to `last`, a strip. price (H, W): full price between a pixel and the one above it. Exact: dynamic
+    programming down and up.
     """
-    count, height, width = costs.shape
-    for strip in prange((width + STRIP - 1) // STRIP):
-        begin = strip * STRIP
-        size = min(STRIP, width - begin)
-        before, message = np.empty((count, size), costs.dtype), np.empty((count, size), costs.dtype)
-        # Copies of the strip's part of two rows: a view of the planes has strides that the compiler cannot know.
-        motions, step = np.empty((2, count, 3, size), costs.dtype), np.empty(size, costs.dtype)
-        step_per_px, least = np.empty(size, costs.dtype), np.empty(size, costs.dtype)
-        for upwards in range(2):
-            for i in range(height):
-                y = height - 1 - i if upwards else i
-                now = i % 2
-                _take_strip(candidates, y, begin, motions[now])
-                if i == 0:
-                    message[:] = 0
-                else:
-                    step[:] = price[y + upwards, begin : begin + size]
-                    step_per_px[:] = step * inverse_scale
-                    _pass_message(motions[now], motions[1 - now], step, step_per_px, before, least, message)
-                for k in range(count):
-                    here = costs[k, y, begin : begin + size]
-                    _add_costs(here, message[k], upwards, before[k], out[k, y, begin : begin + size])
+    count, height, size = costs.shape[0], costs.shape[1], last - first
+    # Copies of the strip's part of two rows: a view of the planes has strides that the compiler cannot know.
+    motions = np.empty((2, count, 3, size), np.float32)
+    labels, rows = np.empty((2, count, size), np.float32), np.empty((3, size), np.float32)
+    before, message, step, step_per_px, least = labels[0], labels[1], rows[0], rows[1], rows[2]
+    for upwards in range(2):
+        for i in range(height):
+            y = height - 1 - i if upwards else i
+            now = i % 2
+            _take_strip(candidates, y, first, motions[now])
+            if i > 0:
+                for x in range(size):
+                    step[x] = price[y + upwards, first + x]
+                    step_per_px[x] = step[x] * inverse_scale
+                _pass_message(motions[now], motions[1 - now], step, step_per_px, before, least, message)
+            else:
+                message[:] = 0
+            for k in range(count):
+                _add_costs(costs[k, y, first:last], message[k], upwards, before[k], out[k, y, first:last])
+
+
+def _strips(columns: int) -> list[int]:
+    """Where strips of columns begin and end."""
+    return [*range(0, columns, STRIP), columns]
 
 
 def _transposed(planes: np.ndarray) -> np.ndarray:
     """(..., W, H) copy of (..., H, W) planes."""
     height, width = planes.shape[-2:]
     turned = np.empty((*planes.shape[:-2], width, height), planes.dtype)
-    for plane, out in zip(planes.reshape(-1, height, width), turned.reshape(-1, width, height), strict=True):
-        cv2.transpose(plane, dst=out)
+    flat, flat_turned = planes.reshape(-1, height, width), turned.reshape(-1, width, height)
+
+    def turn(first: int, last: int) -> None:
+        for k in range(first, last):
+            cv2.transpose(flat[k], dst=flat_turned[k])
+
+    over_bands(turn, range(len(flat) + 1))
     return turned
 
 
-@parallel
-def _cheapest(costs: np.ndarray, labels: np.ndarray) -> None:
+@rowwise
+def _cheapest(first: int, last: int, costs: np.ndarray, labels: np.ndarray) -> None:
     """labels (H, W): the first label of least cost."""
-    count, height, width = costs.shape
-    for y in prange(height):
+    count, _, width = costs.shape
+    for y in range(first, last):
         for x in range(width):
             best = np.int32(0)
             for k in range(1, count):
@@ -224,10 +234,15 @@ def motion_costs(
         (K, H, W) float32; FORBIDDEN where a candidate does not exist.
     """
     costs = np.empty((len(candidates), *disparity.shape), np.float32)
-    _costs(candidates, disparity, *words, np.float32(config.truncation * BITS), np.float32(config.outside_cost), costs)
-    exists = np.isfinite(candidates[:, 1])
-    for k in range(len(costs)):
-        costs[k] = np.where(exists[k], cv2.blur(np.minimum(costs[k], 1), (config.window, config.window)), FORBIDDEN)
+    largest, outside = np.float32(config.truncation * BITS), np.float32(config.outside_cost)
+    over_rows(_costs, len(disparity), candidates, disparity, *words, largest, outside, costs)
+
+    def average(first: int, last: int) -> None:
+        for k in range(first, last):
+            exists = np.isfinite(candidates[k, 1])
+            costs[k] = np.where(exists, cv2.blur(np.minimum(costs[k], 1), (config.window, config.window)), FORBIDDEN)
+
+    over_bands(average, range(len(costs) + 1))
     return costs
 
 
@@ -251,8 +266,11 @@ def choose(
     inverse_scale = np.float32(1 / config.motion_scale_px)
     turned = _transposed(costs)
     rows, trees = np.empty_like(turned), np.empty_like(costs)
-    _chains(_transposed(candidates), turned, cv2.transpose(_price(disparity, grey, 1, config)), inverse_scale, rows)
-    _chains(candidates, _transposed(rows), _price(disparity, grey, 0, config), inverse_scale, trees)
+    height, width = grey.shape
+    price = cv2.transpose(_price(disparity, grey, 1, config))
+    over_bands(_chains, _strips(height), _transposed(candidates), turned, price, inverse_scale, rows)
+    price = _price(disparity, grey, 0, config)
+    over_bands(_chains, _strips(width), candidates, _transposed(rows), price, inverse_scale, trees)
     labels = np.empty(grey.shape, np.int32)
-    _cheapest(trees, labels)
+    over_rows(_cheapest, len(labels), trees, labels)
     return labels

@@ -6,13 +6,15 @@ matched, and the census words of all four images.
 """
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Literal
 
 import cv2
 import numpy as np
 
 from variational.frames import Frames
-from variational.matching import MatchingConfig, StereoMatch, census, fill_background, match
+from variational.jit import side_by_side
+from variational.matching import MatchingConfig, StereoMatch, census, fill_background, find_max_disparity, match
 
 StartName = Literal["matching", "opencv", "zero"]
 MIN_SIDE = 16
@@ -80,7 +82,7 @@ def initialise(frames: Frames, name: StartName, config: MatchingConfig) -> Start
     name : {"matching", "opencv", "zero"}
         Our census matching and dense inverse search, OpenCV's matching and the same flow, or nothing at all.
     config : MatchingConfig
-        Both pairs search one range, the larger of the two that are found.
+        Both pairs search one range, the one that suits the first.
 
     Returns
     -------
@@ -94,13 +96,13 @@ def initialise(frames: Frames, name: StartName, config: MatchingConfig) -> Start
             for left, right in ((left1, right1), (left2, right2))
         ]
         return Start(np.zeros((5, *shape), np.float32), np.zeros((*shape, 2), np.float32), *nothing)
-    match1 = match(left1, right1, config)
-    if name == "opencv":
-        match1 = opencv_match(left1, right1, match1.max_disparity)
-        match2 = opencv_match(left2, right2, match1.max_disparity)
-    else:
-        match2 = match(left2, right2, replace(config, max_disparity=match1.max_disparity))
-    flow = dense_inverse_search(left1, left2)
+    searched = config.max_disparity or find_max_disparity(left1, right1, config)
+    matching = partial(match, config=replace(config, max_disparity=searched))
+    pair = matching if name == "matching" else partial(opencv_match, searched=searched)
+    match1, match2, flow, backward = side_by_side(
+        partial(pair, left1, right1), partial(pair, left2, right2),
+        partial(dense_inverse_search, left1, left2), partial(dense_inverse_search, left2, left1),
+    )  # fmt: skip
     change = sample(match2.disparity, flow) - match1.disparity
     state = np.stack([match1.disparity, match2.disparity, change, flow[..., 0], flow[..., 1]])
-    return Start(state, dense_inverse_search(left2, left1), match1, match2)
+    return Start(state, backward, match1, match2)

@@ -18,7 +18,7 @@ from numba import types
 from numba.extending import intrinsic
 
 from variational.census import census, stereo_costs
-from variational.jit import inlined, parallel, prange, rowwise, scalar
+from variational.jit import inlined, over_bands, over_rows, rowwise, scalar
 
 UNREACHABLE = 12000
 """Above any path cost, and still inside 16 bits with a penalty added."""
@@ -199,37 +199,30 @@ def _select_row(
         matched[x] = matched[x] and agrees
 
 
-@parallel
-def _aggregate(
-    costs: np.ndarray, large_x: np.ndarray, large_y: np.ndarray, small: int, tolerance: float, uniqueness: float,
+@rowwise
+def _sweep(
+    first: int, last: int, half: int, costs: np.ndarray, large_x: np.ndarray, large_y: np.ndarray, small: int,
+    tolerance: float, uniqueness: float, paths: np.ndarray, best: np.ndarray, along: np.ndarray, right: np.ndarray,
     totals: np.ndarray, disparity: np.ndarray, matched: np.ndarray,
 ) -> None:  # fmt: skip
-    """Two sweeps of four paths each, k = 0 from the top left and k = 1 from the bottom right, that meet in the middle.
+    """One half of sweep k, for k = `first` to `last`; k = 0 goes from the top left, k = 1 from the bottom right.
 
-    Each leaves its sums in `totals` (H, W, D), zero at first, on the half that it comes to first, and on the other half
-    completes those of its opposite and selects. large_x[y, x] is the large penalty between (x - 1, y) and (x, y),
-    large_y[y, x] between (x, y - 1) and (x, y); both have one more column or row for the first step of k = 1.
+    A sweep leaves its sums in `totals` (H, W, D), zero at first, on the half that it comes to first, and on the other
+    half completes those of its opposite and selects. See :func:`_aggregate` for the other arrays.
     """
-    height, width, disparities = costs.shape
-    # Path costs of two rows: (k, parity, path, x + 1, d + 1), unreachable beyond both ends of d, zero before the start.
-    paths = np.full((2, 2, 3, width + 2, disparities + 2), np.int16(UNREACHABLE), np.int16)
-    paths[..., 1:-1] = 0
-    best = np.zeros((2, 2, width + 2, 3), np.int16)
-    along = np.full((2, 2, disparities + 2), np.int16(UNREACHABLE), np.int16)
-    right = np.empty((2, 2, width + disparities), np.int16)
-    for half in range(2):
-        for k in prange(2):
-            meeting = height // 2 if k == 0 else height - height // 2
-            for i in range(half * meeting, meeting if half == 0 else height):
-                y = i if k == 0 else height - 1 - i
-                now, before = i % 2, (i + 1) % 2
-                last, new = paths[k, before], paths[k, now]
-                _sweep_row(
-                    costs[y], large_x[y], large_y[y + k], small, 1 - 2 * k, last[0], last[1], last[2], best[k, before],
-                    new[0], new[1], new[2], best[k, now], along[k], totals[y],
-                )  # fmt: skip
-                if half == 1:
-                    _select_row(totals[y], tolerance, uniqueness, right[k, 0], right[k, 1], disparity[y], matched[y])
+    height = costs.shape[0]
+    for k in range(first, last):
+        meeting = height // 2 if k == 0 else height - height // 2
+        for i in range(half * meeting, meeting if half == 0 else height):
+            y = i if k == 0 else height - 1 - i
+            now, before = i % 2, (i + 1) % 2
+            old, new = paths[k, before], paths[k, now]
+            _sweep_row(
+                costs[y], large_x[y], large_y[y + k], small, 1 - 2 * k, old[0], old[1], old[2], best[k, before],
+                new[0], new[1], new[2], best[k, now], along[k], totals[y],
+            )  # fmt: skip
+            if half == 1:
+                _select_row(totals[y], tolerance, uniqueness, right[k, 0], right[k, 1], disparity[y], matched[y])
 
 
 def _large_steps(grey: np.ndarray, config: MatchingConfig) -> tuple[np.ndarray, np.ndarray]:
@@ -240,6 +233,28 @@ def _large_steps(grey: np.ndarray, config: MatchingConfig) -> tuple[np.ndarray, 
         lowered = config.large_step / (1 + step / np.float32(config.edge_contrast))
         penalties.append(np.maximum(lowered, np.float32(1.5 * config.small_step)).astype(np.int16))
     return penalties[0], penalties[1]
+
+
+def _aggregate(costs: np.ndarray, grey: np.ndarray, config: MatchingConfig) -> tuple[np.ndarray, np.ndarray]:
+    """Both sweeps: disparity and matched of :func:`aggregate`, but for its median and its speckles."""
+    (_, width, disparities), small = costs.shape, np.int16(config.small_step)
+    totals = np.zeros(costs.shape, np.int16)
+    disparity, matched = np.empty(costs.shape[:2], np.float32), np.empty(costs.shape[:2], bool)
+    tolerance, uniqueness = np.float32(config.consistency_px), np.float32(config.uniqueness)
+    # Penalties between (x - 1, y) and (x, y), and between (x, y - 1) and (x, y); for the first step of k = 1, one more.
+    large_x, large_y = _large_steps(grey, config)
+    # Path costs of two rows: (k, parity, path, x + 1, d + 1), unreachable beyond both ends of d, zero before the start.
+    paths = np.full((2, 2, 3, width + 2, disparities + 2), UNREACHABLE, np.int16)
+    paths[..., 1:-1] = 0
+    best = np.zeros((2, 2, width + 2, 3), np.int16)
+    along = np.full((2, 2, disparities + 2), UNREACHABLE, np.int16)
+    right = np.empty((2, 2, width + disparities), np.int16)
+    for half in range(2):
+        over_bands(
+            _sweep, range(3), half, costs, large_x, large_y, small, tolerance, uniqueness, paths, best, along, right, totals,
+            disparity, matched,
+        )  # fmt: skip
+    return disparity, matched
 
 
 def aggregate(costs: np.ndarray, grey: np.ndarray, config: MatchingConfig) -> tuple[np.ndarray, np.ndarray]:
@@ -260,21 +275,17 @@ def aggregate(costs: np.ndarray, grey: np.ndarray, config: MatchingConfig) -> tu
     matched : np.ndarray
         (H, W) bool: unique, consistent with the right view, not a speckle.
     """
-    totals = np.zeros(costs.shape, np.int16)
-    disparity, matched = np.empty(costs.shape[:2], np.float32), np.empty(costs.shape[:2], bool)
-    tolerance, uniqueness = np.float32(config.consistency_px), np.float32(config.uniqueness)
-    large_x, large_y = _large_steps(grey, config)
-    _aggregate(costs, large_x, large_y, np.int16(config.small_step), tolerance, uniqueness, totals, disparity, matched)
+    disparity, matched = _aggregate(costs, grey, config)
     disparity = cv2.medianBlur(disparity, 5)
     regions = np.where(matched, np.minimum(disparity, 2000) * 16, -16).astype(np.int16)
     cv2.filterSpeckles(regions, -16, config.speckle_px, 16)
     return disparity, regions >= 0
 
 
-@parallel
-def _fill_rows(disparity: np.ndarray, known: np.ndarray, filled: np.ndarray) -> None:
-    height, width = disparity.shape
-    for y in prange(height):
+@rowwise
+def _fill_rows(first: int, last: int, disparity: np.ndarray, known: np.ndarray, filled: np.ndarray) -> None:
+    width = disparity.shape[1]
+    for y in range(first, last):
         nearest = np.float32(np.inf)
         for x in range(width):
             nearest = disparity[y, x] if known[y, x] else nearest
@@ -294,7 +305,7 @@ def fill_background(disparity: np.ndarray, known: np.ndarray) -> np.ndarray:
     if not known.any():
         return np.zeros_like(disparity)
     filled = np.empty_like(disparity)
-    _fill_rows(disparity, known, filled)
+    over_rows(_fill_rows, len(filled), disparity, known, filled)
     full, empty = np.flatnonzero(known.any(axis=1)), np.flatnonzero(~known.any(axis=1))
     filled[empty] = filled[full[np.abs(full[None] - empty[:, None]).argmin(axis=1)]]
     return filled

@@ -7,10 +7,11 @@ anything that gives a value and a gradient.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
-from variational.jit import band_edges, parallel, prange, rowwise, scalar
+from variational.jit import band_edges, over_bands, over_rows, rowwise, scalar
 
 GROUPS = 4
 """Channels that are smoothed together: D1; C; u and v; D2."""
@@ -33,40 +34,40 @@ def _factorise(a: np.ndarray) -> None:
     a[9] = one / np.sqrt(a[9] - a[3] * a[3] - a[6] * a[6] - a[8] * a[8])
 
 
-@parallel
-def _subtract(state: np.ndarray, reference: np.ndarray, field: np.ndarray) -> None:
+@rowwise
+def _subtract(first: int, last: int, state: np.ndarray, reference: np.ndarray, field: np.ndarray) -> None:
     """field (H + 2, W + 2, 5), zero at its rim: what a state differs by from its reference, pixel by pixel."""
-    _, height, width = state.shape
-    for y in prange(height):
+    width = state.shape[2]
+    for y in range(first, last):
         for x in range(width):
             for i, channel in enumerate(CHANNELS):
                 field[y + 1, x + 1, i] = state[channel, y, x] - reference[channel, y, x]
 
 
-@parallel
-def _add(reference: np.ndarray, field: np.ndarray, state: np.ndarray) -> None:
-    _, height, width = state.shape
-    for y in prange(height):
+@rowwise
+def _add(first: int, last: int, reference: np.ndarray, field: np.ndarray, state: np.ndarray) -> None:
+    width = state.shape[2]
+    for y in range(first, last):
         for i, channel in enumerate(CHANNELS):
             for x in range(width):
                 state[channel, y, x] = reference[channel, y, x] + field[y + 1, x + 1, i]
 
 
-@parallel
+@rowwise
 def _smoothness_weights(
-    field: np.ndarray, edges: np.ndarray, edges2: np.ndarray, lambdas: np.ndarray, eps2: float,
+    first: int, last: int, field: np.ndarray, edges: np.ndarray, edges2: np.ndarray, lambdas: np.ndarray, eps2: float,
     weights: np.ndarray, energy: np.ndarray,
 ) -> None:  # fmt: skip
     """weights (H + 1, W + 1, 2 * GROUPS), zero at first: of each pixel with the one to the left, then the one above."""
-    _, height, width = edges.shape
-    for y in prange(height):
+    width = edges.shape[2]
+    for y in range(first, last):
         row = 0.0
         for x in range(width):
             here = field[y + 1, x + 1]
             for axis in range(2):
                 if (axis == 0 and x == 0) or (axis == 1 and y == 0):
                     continue
-                other = field[np.int64(y) + 1 - axis, x + axis]
+                other = field[y + 1 - axis, x + axis]
                 for g in range(GROUPS):
                     channel = g if g < 3 else 4
                     square = (here[channel] - other[channel]) ** 2
@@ -79,17 +80,18 @@ def _smoothness_weights(
         energy[y] = row
 
 
-@parallel
+@rowwise
 def _prepare(
-    field: np.ndarray, systems: np.ndarray, weights: np.ndarray, pull: np.ndarray, prepared: np.ndarray, energy: np.ndarray
-) -> None:
+    first: int, last: int, field: np.ndarray, systems: np.ndarray, weights: np.ndarray, pull: np.ndarray,
+    prepared: np.ndarray, energy: np.ndarray,
+) -> None:  # fmt: skip
     """prepared (H, W, PREPARED); adds the energies of data and pull at `field` to those of each row.
 
     The right side is A z - b for the unknowns z of the field: what A z_new must be where nothing is smooth. The pull
     towards a correction of zero adds nothing to it.
     """
-    height, width, _ = systems.shape
-    for y in prange(height):
+    width = systems.shape[1]
+    for y in range(first, last):
         row = 0.0
         for x in range(width):
             s, a, z, p = systems[y, x], prepared[y, x], field[y + 1, x + 1], pull[y, x]
@@ -114,7 +116,7 @@ def _prepare(
 
 
 @rowwise
-def _sweep_row(
+def _relax_row(
     field: np.ndarray, prepared: np.ndarray, weights: np.ndarray, y: int, colour: int, omega: np.float32
 ) -> None:
     """Relax the pixels of one colour in one row."""
@@ -142,25 +144,19 @@ def _sweep_row(
         z[4] += omega * (b4 * a[10] - z[4])
 
 
-@parallel
+@rowwise
 def _sweep(
-    field: np.ndarray, prepared: np.ndarray, weights: np.ndarray, omega: np.float32, bands: np.ndarray
+    first: int, last: int, field: np.ndarray, prepared: np.ndarray, weights: np.ndarray, omega: np.float32
 ) -> None:
-    """One sweep, first colour 0 and then colour 1, in one pass through memory.
+    """Colour 0, and colour 1 a row behind, so that both take one pass through memory.
 
-    Colour 1 follows colour 0 a row behind. A band's outermost rows wait for colour 0 of the bands around it, so that
-    the result is that of two half sweeps, whatever the bands.
+    Colour 1 of a band's outermost rows is left out: it has to wait for colour 0 of the bands around.
     """
-    for band in prange(len(bands) - 1):
-        for y in range(bands[band], bands[band + 1]):
-            _sweep_row(field, prepared, weights, y, 0, omega)
-            if y > bands[band] + 1:
-                _sweep_row(field, prepared, weights, y - 1, 1, omega)
-    for band in prange(len(bands) - 1):
-        first, last = bands[band], bands[band + 1] - 1
-        _sweep_row(field, prepared, weights, first, 1, omega)
-        if last > first:
-            _sweep_row(field, prepared, weights, last, 1, omega)
+    for step in range(2 * (last - first)):
+        colour = step % 2
+        y = first + step // 2 - colour
+        if colour == 0 or y > first:
+            _relax_row(field, prepared, weights, y, colour, omega)
 
 
 @dataclass(frozen=True)
@@ -220,13 +216,17 @@ def relax(
     weights = np.zeros((height + 1, width + 1, 2 * GROUPS), np.float32)
     prepared = np.empty((height, width, PREPARED), np.float32)
     lambdas = np.array([config.disparity, config.change, config.flow, config.disparity], np.float32)
-    _subtract(state, reference, field)
-    _smoothness_weights(field, edges, edges2, lambdas, np.float32(config.eps_px**2), weights, rows)
-    _prepare(field, systems, weights, pull, prepared, rows)
+    over_rows(_subtract, height, state, reference, field)
+    over_rows(_smoothness_weights, height, field, edges, edges2, lambdas, np.float32(config.eps_px**2), weights, rows)
+    over_rows(_prepare, height, field, systems, weights, pull, prepared, rows)
+    bands, omega = band_edges(height), np.float32(config.omega)
+    outermost = sorted({row for first, last in pairwise(bands) for row in (first, last - 1)})
     for _ in range(config.sweeps):
-        _sweep(field, prepared, weights, np.float32(config.omega), band_edges(height))
+        over_bands(_sweep, bands, field, prepared, weights, omega)
+        for y in outermost:
+            _relax_row(field, prepared, weights, y, 1, omega)
     relaxed = np.empty_like(state)
-    _add(reference, field, relaxed)
+    over_rows(_add, height, reference, field, relaxed)
     return relaxed, float(rows.cumsum()[-1])
 
 

@@ -6,6 +6,7 @@ those pixels gets a rigid fit of its own. Features: SIFT (Lowe 2004).
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -56,8 +57,29 @@ def unexplained_surfaces(
     return [labels == k for k in order if statistics[k, cv2.CC_STAT_AREA] >= config.least_px]
 
 
+class Landmarks(NamedTuple):
+    """Features of an image: (N, 2) places (x, y) in pixels, (N, 128) float32 descriptions."""
+
+    places: np.ndarray
+    words: np.ndarray
+
+
+def find_landmarks(grey: np.ndarray, config: ObjectsConfig, mask: np.ndarray | None = None) -> Landmarks:
+    """The strongest features of a (H, W) image in [0, 1]; of those only what lies in a (H, W) uint8 mask."""
+    if config.features == 0:
+        return Landmarks(np.empty((0, 2)), np.empty((0, 128), np.float32))
+    detector = cv2.SIFT.create(nfeatures=config.features, contrastThreshold=0.01)
+    # SIFT doubles an image before it begins: halved, its first octave is the image itself, in a quarter of the time
+    half = (grey.shape[1] // 2, grey.shape[0] // 2)
+    small = to_bytes(cv2.resize(grey, half, interpolation=cv2.INTER_AREA))
+    mask = mask if mask is None else cv2.resize(mask, half, interpolation=cv2.INTER_NEAREST)
+    points, words = detector.detectAndCompute(small, mask)
+    places = (np.array([point.pt for point in points]).reshape(-1, 2) + 0.5) * (np.array(grey.shape[::-1]) / half) - 0.5
+    return Landmarks(places, np.empty((0, 128), np.float32) if words is None else words)
+
+
 def find_objects(
-    start: Start, disparity: np.ndarray, left1: np.ndarray, left2: np.ndarray, surfaces: list[np.ndarray],
+    start: Start, disparity: np.ndarray, left1: np.ndarray, landmarks2: Landmarks, surfaces: list[np.ndarray],
     projection: np.ndarray, config: ObjectsConfig,
 ) -> list[RigidMotion]:  # fmt: skip
     """Rigid motions of surfaces, from sparse features.
@@ -68,8 +90,10 @@ def find_objects(
         For the disparity at time 2.
     disparity : np.ndarray
         (H, W) at time 1, pixels.
-    left1, left2 : np.ndarray
+    left1 : np.ndarray
         (H, W) grey in [0, 1].
+    landmarks2 : Landmarks
+        Of left2.
     surfaces : list of np.ndarray
         (H, W) bool masks.
     projection : np.ndarray
@@ -80,25 +104,17 @@ def find_objects(
     list of RigidMotion
         One for each surface whose features agree on a motion.
     """
-    if not surfaces or config.features == 0:
+    if not surfaces or len(landmarks2.places) < 2:
         return []
-    detector = cv2.SIFT.create(nfeatures=config.features, contrastThreshold=0.01)
     around = cv2.dilate(np.any(surfaces, axis=0).astype(np.uint8), np.ones((9, 9), np.uint8))
-    # SIFT doubles an image before it begins: halved, its first octave is the image itself, in a quarter of the time
-    half = (left1.shape[1] // 2, left1.shape[0] // 2)
-    small1, small2 = (to_bytes(cv2.resize(image, half, interpolation=cv2.INTER_AREA)) for image in (left1, left2))
-    points1, words1 = detector.detectAndCompute(small1, cv2.resize(around, half, interpolation=cv2.INTER_NEAREST))
-    points2, words2 = detector.detectAndCompute(small2, None)
-    if words1 is None or words2 is None or len(points2) < 2:
+    landmarks1 = find_landmarks(left1, config, around)
+    if len(landmarks1.places) < config.least_matches:
         return []
-    matcher = cv2.BFMatcher(cv2.NORM_L2)
-    pairs = [pair for pair in matcher.knnMatch(words1, words2, k=2) if len(pair) == 2]
+    pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(landmarks1.words, landmarks2.words, k=2)
     good = [m for m, second in pairs if m.distance < config.ratio * second.distance]
     if len(good) < config.least_matches:
         return []
-    scale = np.array(left1.shape[::-1]) / half
-    at1 = (np.array([points1[m.queryIdx].pt for m in good]) + 0.5) * scale - 0.5
-    at2 = (np.array([points2[m.trainIdx].pt for m in good]) + 0.5) * scale - 0.5
+    at1, at2 = landmarks1.places[[m.queryIdx for m in good]], landmarks2.places[[m.trainIdx for m in good]]
     x1, y1, x2, y2 = np.rint(np.hstack([at1, at2])).astype(np.intp).T
     first = np.column_stack([at1, disparity[y1, x1]])
     second = np.column_stack([at2, start.match2.disparity[y2, x2]])

@@ -13,9 +13,9 @@ from variational.camera import StereoCamera
 from variational.evidence import EvidenceConfig, refill
 from variational.fusion import FusionConfig, choose, motion_costs
 from variational.initialise import Start, sample
-from variational.jit import parallel, prange
+from variational.jit import over_rows, rowwise, side_by_side
 from variational.matching import MatchingConfig
-from variational.objects import ObjectsConfig, find_objects, unexplained_surfaces
+from variational.objects import ObjectsConfig, find_landmarks, find_objects, unexplained_surfaces
 from variational.rigid import Correspondences, RigidConfig, RigidMotion, displacements, find_motions, guess_camera
 from variational.state import D1, C, flow_of
 from variational.visibility import project_visibility
@@ -77,7 +77,7 @@ def _nearby(motions: list[RigidMotion], slots: int = 3) -> np.ndarray:
         reach = 0.6 * np.sqrt(motion.support.sum()) + 15
         rows, columns = (_span(np.any(motion.support, axis), int(1.1 * reach)) for axis in (1, 0))  # chamfers run short
         distance = cv2.distanceTransform((~motion.support[rows, columns]).astype(np.uint8), cv2.DIST_L2, 3)
-        _insert(distance, reach, index, nearest[:, rows, columns], labels[:, rows, columns])
+        over_rows(_insert, len(distance), distance, reach, index, nearest[:, rows, columns], labels[:, rows, columns])
     return labels[: len(motions) - 1]
 
 
@@ -87,11 +87,13 @@ def _span(occupied: np.ndarray, margin: int) -> slice:
     return slice(max(places[0] - margin, 0), places[-1] + margin + 1) if len(places) else slice(0, 0)
 
 
-@parallel
-def _insert(distance: np.ndarray, reach: float, index: int, nearest: np.ndarray, labels: np.ndarray) -> None:
+@rowwise
+def _insert(
+    first: int, last: int, distance: np.ndarray, reach: float, index: int, nearest: np.ndarray, labels: np.ndarray
+) -> None:
     """Put an object into the slots of the pixels in its reach; an earlier one stays ahead at the same distance."""
-    slots, height, width = labels.shape
-    for y in prange(height):
+    slots, _, width = labels.shape
+    for y in range(first, last):
         for x in range(width):
             if distance[y, x] > reach or distance[y, x] >= nearest[slots - 1, y, x]:
                 continue
@@ -102,14 +104,14 @@ def _insert(distance: np.ndarray, reach: float, index: int, nearest: np.ndarray,
             nearest[slot, y, x], labels[slot, y, x] = distance[y, x], index
 
 
-@parallel
+@rowwise
 def _take(
-    chosen: np.ndarray, candidates: np.ndarray, labels_of: np.ndarray, costs: np.ndarray, motion: np.ndarray,
-    labels: np.ndarray, cost: np.ndarray,
+    first: int, last: int, chosen: np.ndarray, candidates: np.ndarray, labels_of: np.ndarray, costs: np.ndarray,
+    motion: np.ndarray, labels: np.ndarray, cost: np.ndarray,
 ) -> None:  # fmt: skip
     """What belongs to the chosen candidate of each pixel: its motion (3, H, W), label and cost (H, W)."""
-    height, width = chosen.shape
-    for y in prange(height):
+    width = chosen.shape[1]
+    for y in range(first, last):
         for x in range(width):
             k = chosen[y, x]
             for i in range(3):
@@ -135,9 +137,13 @@ def propose(
     -------
     Proposal
     """
-    matches = correspondences(start)
-    camera = camera or guess_camera(matches, rigid)
-    motions = find_motions(matches, camera, rigid)
+
+    def search() -> tuple[StereoCamera, list[RigidMotion]]:
+        matches = correspondences(start)
+        known = camera or guess_camera(matches, rigid)
+        return known, find_motions(matches, known, rigid)
+
+    (known, motions), landmarks2 = side_by_side(search, lambda: find_landmarks(grey2, objects))
     if not motions:
         return keep(start)
     words = (start.match1.words_left, start.match2.words_left, start.match2.words_right)
@@ -152,7 +158,7 @@ def propose(
         biased[0] += fusion.measured_prior
         biased[2:] += fusion.object_prior
         chosen, labels, cost = choose(candidates, biased, state[D1], grey, fusion), np.empty_like(nothing), np.empty_like(grey)
-        _take(chosen, candidates, labels_of, costs, state[C:], labels, cost)
+        over_rows(_take, len(grey), chosen, candidates, labels_of, costs, state[C:], labels, cost)
         return labels, cost
 
     nothing = keep(start).labels
@@ -160,7 +166,7 @@ def propose(
     if not evidence.fill:
         return Proposal(state, labels, motions, cost)
     surfaces = unexplained_surfaces(state[D1], cost, project_visibility(state), objects)
-    motions += find_objects(start, state[D1], grey, grey2, surfaces, camera.projection(), objects)
+    motions += find_objects(start, state[D1], grey, landmarks2, surfaces, known.projection(), objects)
     homographies = np.stack([motion.homography for motion in motions])
     state[D1] = refill(start.match1, start.match2, grey, labels, homographies, matching, evidence)
     labels, cost = fuse()

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from variational.camera import StereoCamera
-from variational.jit import parallel, prange, scalar
+from variational.jit import over_rows, rowwise, scalar
 
 logger = logging.getLogger(__name__)
 
@@ -85,10 +85,12 @@ class RigidMotion:
     support: np.ndarray
 
 
-@parallel
-def _displacements(homographies: np.ndarray, labels: np.ndarray, disparity: np.ndarray, moved: np.ndarray) -> None:
-    height, width = disparity.shape
-    for y in prange(height):
+@rowwise
+def _displacements(
+    first: int, last: int, homographies: np.ndarray, labels: np.ndarray, disparity: np.ndarray, moved: np.ndarray
+) -> None:
+    width = disparity.shape[1]
+    for y in range(first, last):
         for k in range(len(labels)):
             for x in range(width):
                 moved[k, :, y, x] = np.nan
@@ -121,23 +123,22 @@ def displacements(homographies: np.ndarray, labels: np.ndarray, disparity: np.nd
         behind the camera.
     """
     moved = np.empty((len(labels), 3, *disparity.shape), np.float32)
-    _displacements(homographies.astype(np.float64), labels, disparity, moved)
+    over_rows(_displacements, len(disparity), homographies.astype(np.float64), labels, disparity, moved)
     return moved
 
 
-@parallel
+@rowwise
 def _followers(
-    homography: np.ndarray, first: np.ndarray, second: np.ndarray, candidates: np.ndarray, tolerance: float,
-    follows: np.ndarray,
+    first: int, last: int, homography: np.ndarray, before: np.ndarray, after: np.ndarray, candidates: np.ndarray,
+    tolerance: float, follows: np.ndarray,
 ) -> None:  # fmt: skip
     """follows (H, W): the candidates whose predicted (x, y, disparity) is within the tolerance."""
-    height, width = candidates.shape
-    h = homography
-    for y in prange(height):
+    width, h = candidates.shape[1], homography
+    for y in range(first, last):
         for x in range(width):
             follows[y, x] = False
             if candidates[y, x]:
-                a, b = first[y, x], second[y, x]
+                a, b = before[y, x], after[y, x]
                 scale = h[3, 0] * a[0] + h[3, 1] * a[1] + h[3, 2] * a[2] + h[3, 3]
                 distance = 0.0
                 for i in range(3):
@@ -154,17 +155,19 @@ def _jump(a: np.ndarray, b: np.ndarray, a_from: np.ndarray, b_from: np.ndarray) 
     return jump
 
 
-@parallel
-def _continuous(first: np.ndarray, second: np.ndarray, candidates: np.ndarray, most: float, out: np.ndarray) -> None:
+@rowwise
+def _continuous(
+    first: int, last: int, before: np.ndarray, after: np.ndarray, candidates: np.ndarray, most: float, out: np.ndarray
+) -> None:
     """out (H, W) uint8: the candidates without a jump to the pixels on the left and above."""
-    height, width = candidates.shape
-    for y in prange(height):
+    width = candidates.shape[1]
+    for y in range(first, last):
         for x in range(width):
             smooth = candidates[y, x]
             if smooth and x > 0:
-                smooth = _jump(first[y, x], second[y, x], first[y, x - 1], second[y, x - 1]) < most
+                smooth = _jump(before[y, x], after[y, x], before[y, x - 1], after[y, x - 1]) < most
             if smooth and y > 0:
-                smooth = _jump(first[y, x], second[y, x], first[y - 1, x], second[y - 1, x]) < most
+                smooth = _jump(before[y, x], after[y, x], before[y - 1, x], after[y - 1, x]) < most
             out[y, x] = smooth
 
 
@@ -306,7 +309,7 @@ def find_motions(matches: Correspondences, camera: StereoCamera, config: RigidCo
             return None
         homography = _homography(transform, camera)
         support = np.empty(region.shape, bool)
-        _followers(homography, matches.first, matches.second, left, config.tolerance_px, support)
+        over_rows(_followers, len(left), homography, matches.first, matches.second, left, config.tolerance_px, support)
         if np.count_nonzero(support & region) < share * np.count_nonzero(region):
             return None
         return RigidMotion(transform, homography, support)
@@ -334,7 +337,7 @@ def find_motions(matches: Correspondences, camera: StereoCamera, config: RigidCo
 def _pieces(matches: Correspondences, left: np.ndarray, config: RigidConfig) -> tuple[np.ndarray, np.ndarray]:
     """Connected pieces of the pixels `left`: (H, W) labels, and the labels from the largest piece to the smallest."""
     smooth = np.empty(left.shape, np.uint8)
-    _continuous(matches.first, matches.second, left, 2 * config.tolerance_px, smooth)
+    over_rows(_continuous, len(left), matches.first, matches.second, left, 2 * config.tolerance_px, smooth)
     opened = cv2.morphologyEx(smooth, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     _, labels, statistics, _ = cv2.connectedComponentsWithStats(opened, connectivity=4)
     return labels, np.argsort(-statistics[1:, cv2.CC_STAT_AREA], kind="stable")[:64] + 1

@@ -6,14 +6,14 @@ in a band of a few pixels at every level follows whatever a level can show.
 
 import numpy as np
 
-from variational.jit import parallel, prange
+from variational.jit import over_rows, rowwise
 from variational.matching import MatchingConfig, StereoMatch, aggregate, census, fill_background, stereo_costs
 
 
-@parallel
-def _forbid_outside(costs: np.ndarray, prior: np.ndarray, radius: float) -> None:
-    height, width, disparities = costs.shape
-    for y in prange(height):
+@rowwise
+def _forbid_outside(first: int, last: int, costs: np.ndarray, prior: np.ndarray, radius: float) -> None:
+    _, width, disparities = costs.shape
+    for y in range(first, last):
         for x in range(width):
             for d in range(disparities):
                 if abs(d - prior[y, x]) > radius:
@@ -43,6 +43,6 @@ def match_around(
     searched = int(min(np.ceil(prior.max() + radius_px), left.shape[1] - 1))
     words_left, words_right = census(left), census(right)
     costs = stereo_costs(words_left, words_right, max(2, searched + 1))
-    _forbid_outside(costs, prior, np.float32(radius_px))
+    over_rows(_forbid_outside, len(costs), costs, prior, np.float32(radius_px))
     disparity, matched = aggregate(costs, left, config)
     return StereoMatch(fill_background(disparity, matched), matched, words_left, words_right, searched)

@@ -65,3 +65,17 @@ def resize_state(state: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     sx, sy = shape[1] / state.shape[2], shape[0] / state.shape[1]
     scale = np.array([sx, sx, sx, sx, sy], state.dtype)[:, None, None]
     return resize_maps(state, shape) * scale
+
+
+def enlarge_state(state: np.ndarray, shape: tuple[int, int], jump_px: float = 1.0) -> np.ndarray:
+    """As :func:`resize_state`, to a larger grid: bilinear on surfaces, the nearest pixel's value at their borders.
+
+    A border is where the two differ by more than `jump_px`, pixels of the new grid; interpolated, it would be a slope
+    that belongs to neither side.
+    """
+    linear = resize_state(state, shape)
+    scale = np.array([shape[1] / state.shape[2]] * 4 + [shape[0] / state.shape[1]], state.dtype)
+    for plane, own, factor in zip(linear, state, scale, strict=True):
+        nearest = factor * cv2.resize(own, shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
+        np.copyto(plane, nearest, where=np.abs(plane - nearest) > jump_px)
+    return linear

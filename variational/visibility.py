@@ -7,34 +7,42 @@ of left2 the nearest, that of largest disparity, is seen.
 
 import numpy as np
 
-from variational.jit import band_edges, parallel, prange
+from variational.jit import over_rows, rowwise, scalar
 from variational.state import D1, C, U, V
 
 
-@parallel
-def _front(disparity: np.ndarray, u: np.ndarray, v: np.ndarray, bands: np.ndarray, front: np.ndarray) -> None:
+@scalar
+def _sources(first: int, last: int, height: int, up: float, down: float) -> tuple[int, int]:
+    """Rows from which something may land on rows `first` to `last`, if nothing moves farther `up` or `down`."""
+    return max(int(first - down) - 2, 0), min(int(last + up) + 2, height)
+
+
+@rowwise
+def _front(
+    first: int, last: int, disparity: np.ndarray, u: np.ndarray, v: np.ndarray, up: float, down: float, front: np.ndarray
+) -> None:
     """front (H, W): largest disparity landing on each pixel of left2 and its direct neighbours, -1 where none lands."""
     height, width = disparity.shape
-    for band in prange(len(bands) - 1):
-        first, last = bands[band], bands[band + 1]
-        for y in range(height):
-            for x in range(width):
-                to_y = int(np.floor(y + v[y, x]))
-                if to_y + 1 < first or to_y >= last:
-                    continue
-                to_x = int(np.floor(x + u[y, x]))
-                for j in range(max(to_y, first), min(to_y + 2, last)):
-                    for i in range(max(to_x, 0), min(to_x + 2, width)):
-                        if disparity[y, x] > front[j, i]:
-                            front[j, i] = disparity[y, x]
+    begin, end = _sources(first, last, height, up, down)
+    for y in range(begin, end):
+        for x in range(width):
+            to_y = int(np.floor(y + v[y, x]))
+            if to_y + 1 < first or to_y >= last:
+                continue
+            to_x = int(np.floor(x + u[y, x]))
+            for j in range(max(to_y, first), min(to_y + 2, last)):
+                for i in range(max(to_x, 0), min(to_x + 2, width)):
+                    if disparity[y, x] > front[j, i]:
+                        front[j, i] = disparity[y, x]
 
 
-@parallel
+@rowwise
 def _seen(
-    disparity: np.ndarray, u: np.ndarray, v: np.ndarray, front: np.ndarray, margin: float, seen: np.ndarray
-) -> None:
+    first: int, last: int, disparity: np.ndarray, u: np.ndarray, v: np.ndarray, front: np.ndarray, margin: float,
+    seen: np.ndarray,
+) -> None:  # fmt: skip
     height, width = disparity.shape
-    for y in prange(height):
+    for y in range(first, last):
         for x in range(width):
             to_x, to_y = int(np.rint(x + u[y, x])), int(np.rint(y + v[y, x]))
             inside = 0 <= to_x < width and 0 <= to_y < height
@@ -43,8 +51,14 @@ def _seen(
 
 def _front_of(state: np.ndarray) -> np.ndarray:
     front = np.full(state.shape[1:], -1, np.float32)
-    _front(np.maximum(state[D1] + state[C], 0), state[U], state[V], band_edges(state.shape[1]), front)
+    over_rows(_front, len(front), np.maximum(state[D1] + state[C], 0), state[U], state[V], *_reach(state), front)
     return front
+
+
+def _reach(state: np.ndarray) -> tuple[float, float]:
+    """How far pixels move up and down at the most, within the image's height."""
+    height = state.shape[1]
+    return float(np.clip(-state[V].min(), 0, height)), float(np.clip(state[V].max(), 0, height))
 
 
 def project_visibility(state: np.ndarray, margin_px: float = 1.5) -> np.ndarray:
@@ -64,32 +78,31 @@ def project_visibility(state: np.ndarray, margin_px: float = 1.5) -> np.ndarray:
     """
     seen = np.empty(state.shape[1:], bool)
     disparity = np.maximum(state[D1] + state[C], 0)
-    _seen(disparity, state[U], state[V], _front_of(state), np.float32(margin_px), seen)
+    over_rows(_seen, len(seen), disparity, state[U], state[V], _front_of(state), np.float32(margin_px), seen)
     return seen
 
 
-@parallel
+@rowwise
 def _backward(
-    disparity: np.ndarray, u: np.ndarray, v: np.ndarray, front: np.ndarray, margin: float, best: np.ndarray,
-    bands: np.ndarray, backward: np.ndarray,
+    first: int, last: int, disparity: np.ndarray, u: np.ndarray, v: np.ndarray, up: float, down: float,
+    front: np.ndarray, margin: float, best: np.ndarray, backward: np.ndarray,
 ) -> None:  # fmt: skip
     height, width = disparity.shape
-    for band in prange(len(bands) - 1):
-        first, last = bands[band], bands[band + 1]
-        for y in range(height):
-            for x in range(width):
-                at_y = y + v[y, x]
-                to_y = int(np.rint(at_y))
-                if not first <= to_y < last:
-                    continue
-                at_x = x + u[y, x]
-                to_x = int(np.rint(at_x))
-                if 0 <= to_x < width and disparity[y, x] >= front[to_y, to_x] - margin:
-                    distance = (at_x - to_x) ** 2 + (at_y - to_y) ** 2
-                    if distance < best[to_y, to_x]:
-                        best[to_y, to_x] = distance
-                        backward[to_y, to_x, 0] = -u[y, x]
-                        backward[to_y, to_x, 1] = -v[y, x]
+    begin, end = _sources(first, last, height, up, down)
+    for y in range(begin, end):
+        for x in range(width):
+            at_y = y + v[y, x]
+            to_y = int(np.rint(at_y))
+            if not first <= to_y < last:
+                continue
+            at_x = x + u[y, x]
+            to_x = int(np.rint(at_x))
+            if 0 <= to_x < width and disparity[y, x] >= front[to_y, to_x] - margin:
+                distance = (at_x - to_x) ** 2 + (at_y - to_y) ** 2
+                if distance < best[to_y, to_x]:
+                    best[to_y, to_x] = distance
+                    backward[to_y, to_x, 0] = -u[y, x]
+                    backward[to_y, to_x, 1] = -v[y, x]
 
 
 def backward_flow(state: np.ndarray, fallback: np.ndarray, margin_px: float = 1.5) -> np.ndarray:
@@ -110,6 +123,6 @@ def backward_flow(state: np.ndarray, fallback: np.ndarray, margin_px: float = 1.
     backward = fallback.astype(np.float32, copy=True)
     best = np.full(state.shape[1:], np.inf, np.float32)
     disparity = np.maximum(state[D1] + state[C], 0)
-    bands = band_edges(state.shape[1])
-    _backward(disparity, state[U], state[V], _front_of(state), np.float32(margin_px), best, bands, backward)
+    front, margin = _front_of(state), np.float32(margin_px)
+    over_rows(_backward, len(best), disparity, state[U], state[V], *_reach(state), front, margin, best, backward)
     return backward

@@ -279,7 +279,7 @@ def shade(
     """
     light = illumination[0]
     bias, haze, cloud = light.shadow_bias_m, light.haze_per_m, textures.size - 1
-    number, whole = np.zeros((26, _CHUNK)), np.zeros((6, _CHUNK), np.int32)
+    number, whole = np.zeros((27, _CHUNK)), np.zeros((6, _CHUNK), np.int32)
     space, whole_space = np.zeros((7, 2 * _CHUNK + 2)), np.zeros((5, 2 * _CHUNK + 2), np.int32)
     texture, fine, color, radiance = np.zeros((3, _CHUNK)), np.zeros((3, _CHUNK)), np.zeros((3, _CHUNK)), np.zeros((3, _CHUNK))
     x, y, depth, u, v, nx, ny, nz = (
@@ -292,11 +292,12 @@ def shade(
         number[16], number[17], number[18], number[19], number[20], number[21], number[22], number[23], number[24], number[25]
     )  # fmt: skip
     triangle, material, which, taps, place, mirrors = whole[0], whole[1], whole[2], whole[3], whole[4], whole[5]
-    amplitude = fine_texels
+    amplitude = number[26]
+    mixed, nearest = np.bool_(True), np.bool_(False)  # of texture lookups
 
     for first in range(0, rays, _CHUNK):
         last = min(first + _CHUNK, rays)
-        met = 0
+        met = np.int64(0)
         for ray in range(first, last):
             if hit[ray] >= 0:
                 triangle[met], material[met], place[met] = hit[ray], material_of[hit[ray]], ray - first
@@ -307,24 +308,23 @@ def shade(
         _footprint(
             met, material, materials, textures, u, v, ux, uy, vx, vy, which, at_u, at_v, step_u, step_v, taps, texels, fine_texels
         )
-        look_up(met, textures, atlas, which, at_u, at_v, step_u, step_v, taps, texels, True, texture, space, whole_space)
-        texels[:met] = fine_texels[:met]
-        _fine(met, material, materials, texels, u, v, which, at_u, at_v, taps, amplitude)
-        look_up(met, textures, atlas, which, at_u, at_v, step_u, step_v, taps, texels, False, fine, space, whole_space)
+        look_up(met, textures, atlas, which, at_u, at_v, step_u, step_v, taps, texels, mixed, texture, space, whole_space)
+        _fine(met, material, materials, fine_texels, u, v, which, at_u, at_v, taps, amplitude)
+        look_up(met, textures, atlas, which, at_u, at_v, step_u, step_v, taps, fine_texels, nearest, fine, space, whole_space)
         _light(
             met, x, y, depth, sight, illumination, nx, ny, nz, dx, dy, dz, distance, facing, cosine, half, lit, ux, uy, vx
         )
         _shadow(met, depth_map, bias, cosine, ux, uy, vx, lit)
         _color(met, material, materials, illumination, texture, fine, amplitude, ny, cosine, half, lit, color)
 
-        mirrored = 0
+        mirrored = np.int64(0)
         for i in range(met):
             if materials[material[i]].mirror * light.gloss > 0.0:
                 mirrors[mirrored] = i
                 ux[mirrored], uy[mirrored], vx[mirrored] = dx[i], dy[i], dz[i]
                 mirrored += 1
         _sky_lookups(mirrored, cloud, uy, ux, vx, which, at_u, at_v, taps, texels)
-        look_up(mirrored, textures, atlas, which, at_u, at_v, at_u, at_v, taps, texels, False, fine, space, whole_space)
+        look_up(mirrored, textures, atlas, which, at_u, at_v, at_u, at_v, taps, texels, nearest, fine, space, whole_space)
         _sky_color(mirrored, uy, illumination, fine)
         for k in range(mirrored):
             i = mirrors[k]
@@ -336,7 +336,7 @@ def shade(
             for channel in range(3):
                 radiance[channel, place[i]] = clear * color[channel, i] + (1.0 - clear) * light.horizon[channel]
 
-        missed = 0
+        missed = np.int64(0)
         for ray in range(first, last):
             if hit[ray] < 0:
                 dx[missed] = sight[0, 0] * x_of[ray] + sight[1, 0] * y_of[ray] + sight[2, 0]
@@ -347,7 +347,7 @@ def shade(
                 place[missed] = ray - first
                 missed += 1
         _sky_lookups(missed, cloud, dy, dx, dz, which, at_u, at_v, taps, texels)
-        look_up(missed, textures, atlas, which, at_u, at_v, at_u, at_v, taps, texels, False, color, space, whole_space)
+        look_up(missed, textures, atlas, which, at_u, at_v, at_u, at_v, taps, texels, nearest, color, space, whole_space)
         _sky_color(missed, dy, illumination, color)
         for i in range(missed):
             for channel in range(3):

@@ -7,16 +7,11 @@ import pytest
 
 from tests.variational.scenes import two_layers
 from variational.camera import StereoCamera
-from variational.descent import RefineConfig
-from variational.evidence import EvidenceConfig
-from variational.objects import ObjectsConfig
 from variational.solver import SolverConfig, solve
 
 CONFIGS = {
     "default": SolverConfig(),
-    "fast": SolverConfig(
-        evidence=EvidenceConfig(fill=False), objects=ObjectsConfig(features=0), refine=RefineConfig(warps=0)
-    ),
+    "fast": SolverConfig(size=0.5),
 }
 
 

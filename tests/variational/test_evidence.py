@@ -95,11 +95,11 @@ def test_costs_equal_their_plain_twin():
     homographies[1, 3, :3] = 0.004, 0.003, -0.05
     homographies = homographies.astype(f)
     front, costs = np.empty((height, width + disparities), f), np.empty((height, width, disparities), np.uint8)
-    _front(disparity, matched, front)
+    _front(0, len(front), disparity, matched, front)
     left1, right1, left2, right2 = words
     _write_costs(
-        disparity, matched, front, left1, np.ascontiguousarray(right1[..., ::-1]), left2.reshape(2, -1), right2.reshape(2, -1),
-        labels, homographies, f(config.anchor_per_px), f(config.hidden_cost), f(config.contradicted_cost),
+        0, len(costs), disparity, matched, front, left1, np.ascontiguousarray(right1[..., ::-1]), left2.reshape(2, -1),
+        right2.reshape(2, -1), labels, homographies, f(config.anchor_per_px), f(config.hidden_cost), f(config.contradicted_cost),
         f(config.time_weight), f(config.unknown_cost), f(config.background_per_px), f(config.background_most), costs,
     )  # fmt: skip
     expected = plain_costs(disparity, matched, words, labels, homographies.astype(float), disparities, config)

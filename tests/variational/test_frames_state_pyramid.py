@@ -5,7 +5,7 @@ import pytest
 
 from variational.frames import Frames
 from variational.pyramid import frames_pyramid, image_pyramid, pyramid_shapes, resize_image
-from variational.state import D1, D2, C, U, V, flow_of, resize_state, zero_state
+from variational.state import D1, D2, C, U, V, enlarge_state, flow_of, resize_state, zero_state
 
 
 def image(shape=(6, 8, 3), dtype=np.float32, seed=0):
@@ -84,3 +84,17 @@ def test_pyramids_have_the_sizes_asked_for():
     levels = frames_pyramid(Frames(*(image((37, 53, 1), seed=i) for i in range(4))), shapes)
     assert [level.shape for level in levels] == shapes
     assert [level.shape[:2] for level in image_pyramid(image((37, 53, 3)), shapes)] == shapes
+
+
+def test_enlarging_keeps_slopes_and_does_not_smear_jumps():
+    """A slanted plane stays one; between two surfaces nothing new appears."""
+    state = zero_state((10, 20))
+    state[D1] = 8 + 0.25 * np.arange(20)
+    state[V] = 1.5
+    state[U, :, 11:] = 30
+    large = enlarge_state(state, (25, 40))
+    inside = slice(1, -1)
+    assert np.allclose(large[D1][:, inside], (16 + 0.5 * ((np.arange(40) + 0.5) / 2 - 0.5))[inside], atol=1e-4)
+    assert np.allclose(large[V], 1.5 * 25 / 10)
+    assert set(np.unique(large[U])) == {0, 60}
+    assert len(np.unique(resize_state(state, (25, 40))[U])) > 2

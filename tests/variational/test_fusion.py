@@ -21,7 +21,7 @@ def random_problem(count: int, height: int, width: int) -> tuple[np.ndarray, np.
 def test_a_chain_equals_the_best_of_all_labellings() -> None:
     candidates, costs, price = random_problem(3, 6, 5)
     best = np.empty_like(costs)
-    _chains(candidates, costs, price, np.float32(1 / 10), best)
+    _chains(0, costs.shape[2], candidates, costs, price, np.float32(1 / 10), best)
     for x in range(5):
         expected = naive_matching.chain_minimum(candidates[..., x], costs[..., x], price[:, x], 10)
         difference = best[..., x] - expected
@@ -76,10 +76,10 @@ def test_the_true_motion_is_chosen_and_outside_costs_a_constant() -> None:
     assert (labels[8:-8, 8:-10] == 0).mean() > 0.99
 
 
-@pytest.mark.parametrize("margin", [0.5, 1.5])
-def test_projection_equals_its_plain_twin(margin: float) -> None:
+@pytest.mark.parametrize(("margin", "height", "spread_px"), [(0.5, 29, 3), (1.5, 29, 3), (1.0, 100, 3), (1.0, 100, 40)])
+def test_projection_equals_its_plain_twin(margin: float, height: int, spread_px: float) -> None:
     rng = np.random.default_rng(4)
-    state = rng.normal(0, 3, (5, 29, 37)).astype(np.float32)
+    state = rng.normal(0, spread_px, (5, height, 37)).astype(np.float32)
     state[0] = rng.uniform(0, 12, state[0].shape)
     kept = state.copy()
     np.testing.assert_array_equal(project_visibility(state, margin), naive_matching.visible(state, margin))

@@ -1,9 +1,13 @@
 """The small scalars under the terms, and what the compiler makes of them."""
 
+import multiprocessing
+import time
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 
-from variational.jit import band_edges, total
+from variational.jit import band_edges, over_bands, over_rows, rowwise, total
 from variational.penalties import penalty
 from variational.sampling import cell, interpolate
 from variational.terms.photometric import padded_planes, reflect, window_overlap
@@ -67,3 +71,42 @@ def test_bands_cover_every_row_once():
         assert edges[0] == 0
         assert edges[-1] == height
         assert (np.diff(edges) > 0).all()
+
+
+@rowwise
+def count(first, last, visits):
+    for y in range(first, last):
+        for x in range(visits.shape[1]):
+            visits[y, x] += 1
+
+
+def test_every_row_is_visited_once_whoever_else_calls():
+    counted = [np.zeros((300, 40), np.int32) for _ in range(8)]
+    with ThreadPoolExecutor(4) as callers:
+        list(callers.map(lambda visits: [over_rows(count, 300, visits) for _ in range(50)], counted))
+    over_bands(count, [0, 7, 8, 100], counted[0])
+    assert (counted[0][:100] == 51).all()
+    assert (counted[0][100:] == 50).all()
+    assert all((visits == 50).all() for visits in counted[1:])
+
+
+def test_an_error_in_any_band_reaches_the_caller():
+    def refuse(first, last, bad):
+        time.sleep(0.002)  # so that a helper takes bands too
+        if first == bad:
+            raise OverflowError(f"band {bad}")
+
+    for bad in range(8):
+        with pytest.raises(OverflowError, match=f"band {bad}"):
+            over_bands(refuse, range(9), bad)
+
+
+@pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="no fork here")
+@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
+def test_a_forked_child_has_helpers_of_its_own():
+    visits = np.zeros((300, 40), np.int32)
+    over_rows(count, 300, visits)
+    child = multiprocessing.get_context("fork").Process(target=over_rows, args=(count, 300, visits))
+    child.start()
+    child.join(20)
+    assert child.exitcode == 0

@@ -48,9 +48,7 @@ def test_aggregation_equals_the_plain_recursion(shape: tuple[int, int, int]) -> 
 
     total = naive_matching.aggregate(costs, large, config.small_step)
     expected, expected_matched = naive_matching.select(total, 1.0, config.uniqueness)
-    disparity, matched = np.empty(shape[:2], np.float32), np.empty(shape[:2], bool)
-    small, limits = np.int16(config.small_step), (np.float32(1), np.float32(config.uniqueness))
-    _aggregate(costs, large_x, large_y, small, *limits, np.zeros(shape, np.int16), disparity, matched)
+    disparity, matched = _aggregate(costs, grey, config)
     np.testing.assert_allclose(disparity, expected, atol=1e-6)
     np.testing.assert_array_equal(matched, expected_matched)
 

@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 
 from variational.frames import Frames
-from variational.jit import parallel, prange, scalar
+from variational.jit import over_rows, rowwise, scalar
 
 SYSTEM = 18
 """Numbers a pixel: 10 of A (upper triangle, by rows), 4 of b, then A and b of D2, E of both."""
@@ -99,14 +99,15 @@ def _compare(
     return True
 
 
-@parallel
+@rowwise
 def _systems(
-    state: np.ndarray, left1: np.ndarray, right1: np.ndarray, left2: np.ndarray, right2: np.ndarray, seen_right1: np.ndarray,
-    seen_left2: np.ndarray, seen_right2: np.ndarray, weights: np.ndarray, zeta2: float, eps2: float, systems: np.ndarray,
+    first: int, last: int, state: np.ndarray, left1: np.ndarray, right1: np.ndarray, left2: np.ndarray, right2: np.ndarray,
+    seen_right1: np.ndarray, seen_left2: np.ndarray, seen_right2: np.ndarray, weights: np.ndarray, zeta2: float, eps2: float,
+    systems: np.ndarray,
 ) -> None:  # fmt: skip
     _, height, width = state.shape
-    for y in prange(height):
-        pair = np.empty(6, np.float32)
+    pair = np.empty(6, np.float32)
+    for y in range(first, last):
         for x in range(width):
             s = systems[y, x]
             s[:] = 0
@@ -204,5 +205,6 @@ class Constancy:
         c = self.config
         weights = np.array([c.stereo_weight, c.flow_weight, c.cross_weight, c.coupling_weight], np.float32)
         systems = np.empty((*self.shape, SYSTEM), np.float32)
-        _systems(state, *self._features, *seen, weights, np.float32(c.zeta**2), np.float32(c.eps_px**2), systems)
+        zeta2, eps2 = np.float32(c.zeta**2), np.float32(c.eps_px**2)
+        over_rows(_systems, self.shape[0], state, *self._features, *seen, weights, zeta2, eps2, systems)
         return systems

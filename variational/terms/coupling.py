@@ -47,8 +47,8 @@ def _coupling_row(d1: np.ndarray, d2: np.ndarray, change: np.ndarray, u: np.ndar
 
 
 @rowwise
-def coupling_band(state: np.ndarray, d2: np.ndarray, visible: np.ndarray, weight: float, eps: float, first: int,
-                  last: int, loss: np.ndarray, gradient: np.ndarray, index: np.ndarray, parts: np.ndarray) -> None:
+def coupling_band(first: int, last: int, state: np.ndarray, d2: np.ndarray, visible: np.ndarray, weight: float,
+                  eps: float, loss: np.ndarray, gradient: np.ndarray, index: np.ndarray, parts: np.ndarray) -> None:
     """Add the term of rows `first` to `last` (excluded) and its gradient by D1, C, u, v.
 
     Parameters
@@ -99,7 +99,7 @@ def _scatter_row(index: np.ndarray, fx: np.ndarray, fy: np.ndarray, pull: np.nda
 
 
 @rowwise
-def scatter_band(index: np.ndarray, parts: np.ndarray, first: int, last: int, gradient: np.ndarray) -> None:
+def scatter_band(first: int, last: int, index: np.ndarray, parts: np.ndarray, gradient: np.ndarray) -> None:
     """Add the gradient by D2 of *target* rows `first` to `last` (excluded).
 
     Parameters

@@ -71,43 +71,54 @@ def reflect(i: int, size: int) -> int:
 
 
 @rowwise
-def _locate(dx: np.ndarray, dy: np.ndarray | None, sign: float, y: int, shape: tuple[int, int], visible: np.ndarray,
-            drop_outside: bool, weight: float, index: np.ndarray, fx: np.ndarray, fy: np.ndarray, in_x: np.ndarray,
-            in_y: np.ndarray, keep: np.ndarray) -> None:
-    """Cells of one row of positions in the padded source, and `keep`, the weight of each pixel's error."""
-    zero, one = real(0, weight), real(1, weight)
-    height, width, row = real(shape[0], weight), real(shape[1], weight), real(y, weight)
-    stride = np.int32(shape[1] + 2)
+def _locate_along(d: np.ndarray, sign: float, y: int, shape: tuple[int, int], visible: np.ndarray, weight: float,
+                  drop_outside: bool, index: np.ndarray, fraction: np.ndarray, inside: np.ndarray,
+                  keep: np.ndarray) -> None:
+    """Cells along x of one row of positions in the padded source, and `keep`, the weight of each pixel's error."""
+    zero, one, width = real(0, weight), real(1, weight), real(shape[1], weight)
     start = np.int32((y + 1) * (shape[1] + 2) + 1)
     for i in range(index.size):
         x = np.int32(i)
-        shift, fx[i], inside = cell(sign * dx[i], real(x, weight), width)
+        shift, fraction[i], within = cell(sign * d[i], real(x, weight), width)
         index[i] = start + x + np.int32(shift)
-        in_x[i] = one if inside else zero
-        if dy is not None:
-            shift, fy[i], inside_y = cell(dy[i], row, height)
-            index[i] += np.int32(shift) * stride
-            in_y[i] = one if inside_y else zero
-            inside = inside and inside_y
-        keep[i] = weight if visible[i] and (inside or not drop_outside) else zero
+        inside[i] = one if within else zero
+        keep[i] = weight if visible[i] and (within or not drop_outside) else zero
 
 
 @rowwise
-def _warp(source: np.ndarray, vertical: np.ndarray | None, index: np.ndarray, fx: np.ndarray, fy: np.ndarray,
-          in_x: np.ndarray, in_y: np.ndarray, right: int, below: int, b: np.ndarray, slope_x: np.ndarray,
-          slope_y: np.ndarray) -> None:
-    """Sample one row of one channel: b, and its derivatives along x and y. `right`, `below`: steps."""
+def _locate_down(d: np.ndarray, y: int, shape: tuple[int, int], weight: float, drop_outside: bool, index: np.ndarray,
+                 fraction: np.ndarray, inside: np.ndarray, keep: np.ndarray) -> None:
+    """Move the cells of :func:`_locate_along` along y."""
+    zero, one, height, row = real(0, weight), real(1, weight), real(shape[0], weight), real(y, weight)
+    stride = np.int32(shape[1] + 2)
+    for i in range(index.size):
+        shift, fraction[i], within = cell(d[i], row, height)
+        index[i] += np.int32(shift) * stride
+        inside[i] = one if within else zero
+        keep[i] = keep[i] if within or not drop_outside else zero
+
+
+@rowwise
+def _warp_along(source: np.ndarray, index: np.ndarray, fx: np.ndarray, in_x: np.ndarray, right: int, b: np.ndarray,
+                slope_x: np.ndarray) -> None:
+    """Sample one row of one channel between two neighbours: b, and its derivative. `right`: step."""
     for i in range(index.size):
         k = np.uint32(index[i])
-        v00, v01 = source[k], source[k + right]
-        if vertical is None:
-            b[i + 1] = v00 + fx[i] * (v01 - v00)
-            slope_x[i] = (v01 - v00) * in_x[i]
-        else:
-            v10, v11 = source[k + below], source[k + right + below]
-            b[i + 1], along_x, along_y = interpolate(v00, v01, v10, v11, fx[i], fy[i])
-            slope_x[i] = along_x * in_x[i]
-            slope_y[i] = along_y * in_y[i]
+        v0, v1 = source[k], source[k + right]
+        b[i + 1] = v0 + fx[i] * (v1 - v0)
+        slope_x[i] = (v1 - v0) * in_x[i]
+
+
+@rowwise
+def _warp(source: np.ndarray, index: np.ndarray, fx: np.ndarray, fy: np.ndarray, in_x: np.ndarray, in_y: np.ndarray,
+          right: int, below: int, b: np.ndarray, slope_x: np.ndarray, slope_y: np.ndarray) -> None:
+    """Sample one row of one channel in its cells: b, and its derivatives along x and y. `right`, `below`: steps."""
+    for i in range(index.size):
+        k = np.uint32(index[i])
+        v00, v01, v10, v11 = source[k], source[k + right], source[k + below], source[k + right + below]
+        b[i + 1], along_x, along_y = interpolate(v00, v01, v10, v11, fx[i], fy[i])
+        slope_x[i] = along_x * in_x[i]
+        slope_y[i] = along_y * in_y[i]
 
 
 @scalar
@@ -148,10 +159,9 @@ def _error(a0: np.ndarray, a1: np.ndarray, a2: np.ndarray, b0: np.ndarray, b1: n
 @rowwise
 def _gradient(p0: np.ndarray, p1: np.ndarray, p2: np.ndarray, q0: np.ndarray, q1: np.ndarray, q2: np.ndarray,
               r0: np.ndarray, r1: np.ndarray, r2: np.ndarray, above: float, here: float, below: float,
-              overlap: np.ndarray, a: np.ndarray, b: np.ndarray, slope_x: np.ndarray, slope_y: np.ndarray,
-              vertical: np.ndarray | None, keep: np.ndarray, sign: float, beta: float, eps: float, grad_x: np.ndarray,
-              grad_y: np.ndarray) -> None:
-    """Add one row and channel of dE / dd; the four weights are those of :func:`window_overlap`."""
+              overlap: np.ndarray, a: np.ndarray, b: np.ndarray, keep: np.ndarray, beta: float, eps: float,
+              derivative: np.ndarray) -> None:
+    """dE / db of one row and channel; the four weights are those of :func:`window_overlap`."""
     lp, mp = above * p0[0] + here * p1[0] + below * p2[0], above * p0[1] + here * p1[1] + below * p2[1]
     lq, mq = above * q0[0] + here * q1[0] + below * q2[0], above * q0[1] + here * q1[1] + below * q2[1]
     lr, mr = above * r0[0] + here * r1[0] + below * r2[0], above * r0[1] + here * r1[1] + below * r2[1]
@@ -166,16 +176,21 @@ def _gradient(p0: np.ndarray, p1: np.ndarray, p2: np.ndarray, q0: np.ndarray, q1
         db += a[i + 1] * (left * lr + centre * mr + right * rr)
         lp, lq, lr = mp, mq, mr
         mp, mq, mr = rp, rq, rr
-        grad_x[i] += sign * db * slope_x[i]
-        if vertical is not None:
-            grad_y[i] += db * slope_y[i]
+        derivative[i] = db
 
 
 @rowwise
-def photometric_band(target: np.ndarray, source: np.ndarray, dx: np.ndarray, dy: np.ndarray | None, sign: float,
-                     visible: np.ndarray, overlap_y: np.ndarray, overlap_x: np.ndarray, weight: float, alpha: float,
-                     eps: float, drop_outside: bool, first: int, last: int, loss: np.ndarray, grad_x: np.ndarray,
-                     grad_y: np.ndarray, with_gradient: bool) -> None:
+def _chain(derivative: np.ndarray, slope: np.ndarray, sign: float, grad: np.ndarray) -> None:
+    """Chain rule: add dE / db times the derivative of b by one displacement."""
+    for i in range(derivative.size):
+        grad[i] += sign * derivative[i] * slope[i]
+
+
+@rowwise
+def photometric_band(first: int, last: int, target: np.ndarray, source: np.ndarray, dx: np.ndarray, dy: np.ndarray,
+                     moves_down: bool, sign: float, visible: np.ndarray, overlap_y: np.ndarray, overlap_x: np.ndarray,
+                     weight: float, alpha: float, eps: float, drop_outside: bool, loss: np.ndarray,
+                     grad_x: np.ndarray, grad_y: np.ndarray, with_gradient: bool) -> None:
     """Add the term of rows `first` to `last` (excluded) to the map and the gradient.
 
     Parameters
@@ -184,8 +199,10 @@ def photometric_band(target: np.ndarray, source: np.ndarray, dx: np.ndarray, dy:
         a, as :func:`padded_planes` gives it.
     source : np.ndarray
         The image to sample, likewise, with the last two axes flattened.
-    dx, dy : np.ndarray, np.ndarray or None
-        ``(H, W)`` displacements in pixels; None for a stereo pair, where nothing moves vertically.
+    dx, dy : np.ndarray
+        ``(H, W)`` displacements in pixels.
+    moves_down : bool
+        False for a stereo pair, where nothing moves vertically: then `dy` and `grad_y` are left alone.
     sign : float
         1 or -1 times dx is the displacement: disparities point to the left.
     visible : np.ndarray
@@ -195,28 +212,32 @@ def photometric_band(target: np.ndarray, source: np.ndarray, dx: np.ndarray, dy:
     weight, alpha, eps, drop_outside :
         As in :class:`variational.energy.EnergyConfig`.
     loss, grad_x, grad_y : np.ndarray
-        ``(H, W)``, added to; grad_y is left alone where dy is None.
+        ``(H, W)``, added to.
     """
     channels, height, width = target.shape[0], target.shape[1] - 2, target.shape[2] - 2
-    kind = target.dtype.type
+    shape, kind = (height, width), target.dtype.type
     weight, sign, alpha, eps = kind(weight / channels), kind(sign), kind(alpha), kind(eps)
     right, below = np.uint32(min(width - 1, 1)), np.uint32((width + 2) * min(height - 1, 1))
-    index, cells = np.empty(width, np.int32), np.empty((4, width), target.dtype)
-    fx, fy, in_x, in_y = cells[0], cells[1], cells[2], cells[3]
+    index, rows = np.empty(width, np.int32), np.empty((6, width), target.dtype)
+    fx, fy, in_x, in_y, derivative, spare = rows[0], rows[1], rows[2], rows[3], rows[4], rows[5]
     # Rings of three rows, row y in slot y % 3. P, Q and R are zero in their padding.
     keep, slopes = np.empty((3, width), target.dtype), np.empty((2, channels, 3, width), target.dtype)
     warped = np.empty((channels, 3, width + 2), target.dtype)
-    pqr = np.zeros((3, channels, 3, width + 2), target.dtype)
-    spare = np.empty(width, target.dtype)
+    pqr = np.empty((3, channels, 3, width + 2), target.dtype)
+    pqr[:] = 0
     for step in range(first - 2, last + 2):
         y = step
         if 0 <= y < height:
             slot = y % 3
-            _locate(dx[y], None if dy is None else dy[y], sign, y, (height, width), visible[y], drop_outside, weight,
-                    index, fx, fy, in_x, in_y, keep[slot])
+            _locate_along(dx[y], sign, y, shape, visible[y], weight, drop_outside, index, fx, in_x, keep[slot])
+            if moves_down:
+                _locate_down(dy[y], y, shape, weight, drop_outside, index, fy, in_y, keep[slot])
             for c in range(channels):
                 b = warped[c, slot]
-                _warp(source[c], dy, index, fx, fy, in_x, in_y, right, below, b, slopes[0, c, slot], slopes[1, c, slot])
+                if moves_down:
+                    _warp(source[c], index, fx, fy, in_x, in_y, right, below, b, slopes[0, c, slot], slopes[1, c, slot])
+                else:
+                    _warp_along(source[c], index, fx, in_x, right, b, slopes[0, c, slot])
                 b[0], b[width + 1] = b[min(2, width)], b[max(width - 1, 1)]
         y = step - 1
         if max(first - 1, 0) <= y < min(last + 1, height):
@@ -232,6 +253,8 @@ def photometric_band(target: np.ndarray, source: np.ndarray, dx: np.ndarray, dy:
             for c in range(channels):
                 p, q, r = pqr[0, c], pqr[1, c], pqr[2, c]
                 _gradient(p[up], p[slot], p[down], q[up], q[slot], q[down], r[up], r[slot], r[down], overlap_y[0, y],
-                          overlap_y[1, y], overlap_y[2, y], overlap_x, target[c, y + 1], warped[c, slot],
-                          slopes[0, c, slot], slopes[1, c, slot], dy, keep[slot], sign, kind(1) - alpha, eps, grad_x[y],
-                          grad_y[y])
+                          overlap_y[1, y], overlap_y[2, y], overlap_x, target[c, y + 1], warped[c, slot], keep[slot],
+                          kind(1) - alpha, eps, derivative)
+                _chain(derivative, slopes[0, c, slot], sign, grad_x[y])
+                if moves_down:
+                    _chain(derivative, slopes[1, c, slot], kind(1), grad_y[y])

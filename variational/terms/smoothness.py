@@ -46,7 +46,7 @@ def _between_rows(above: np.ndarray, f: np.ndarray, below: np.ndarray, edge_abov
 
 
 @rowwise
-def smoothness_band(plane: np.ndarray, edges: np.ndarray, weight: float, eps: float, first: int, last: int,
+def smoothness_band(first: int, last: int, plane: np.ndarray, edges: np.ndarray, weight: float, eps: float,
                     loss: np.ndarray, grad: np.ndarray) -> None:
     """Add the term of one channel, rows `first` to `last` (excluded).
 

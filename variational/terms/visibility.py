@@ -7,7 +7,7 @@ relative, w2 in square pixels. O is a constant for differentiation. Reference: S
 
 import numpy as np
 
-from variational.jit import band_edges, parallel, prange, real, rowwise
+from variational.jit import over_rows, real, rowwise
 from variational.sampling import cell, interpolate
 
 
@@ -31,19 +31,12 @@ def _visible_row(u: np.ndarray, v: np.ndarray, y: int, back_u: np.ndarray, back_
 
 
 @rowwise
-def visible_band(u: np.ndarray, v: np.ndarray, backward: np.ndarray, relative: float, absolute: float, first: int,
-                 last: int, visible: np.ndarray) -> None:
+def visible_band(first: int, last: int, u: np.ndarray, v: np.ndarray, backward: np.ndarray, relative: float,
+                 absolute: float, visible: np.ndarray) -> None:
     """Rows `first` to `last` (excluded) of O; u, v ``(H, W)``, backward ``(2, H * W)``, visible ``(H, W)`` bool."""
     kind = u.dtype.type
     for y in range(first, last):
         _visible_row(u[y], v[y], y, backward[0], backward[1], u.shape, kind(relative), kind(absolute), visible[y])
-
-
-@parallel
-def _visible_mask(u: np.ndarray, v: np.ndarray, backward: np.ndarray, relative: float, absolute: float,
-                  bands: np.ndarray, visible: np.ndarray) -> None:
-    for band in prange(bands.size - 1):
-        visible_band(u, v, backward, relative, absolute, bands[band], bands[band + 1], visible)
 
 
 def flow_planes(flow: np.ndarray, dtype: np.dtype | type) -> np.ndarray:
@@ -73,7 +66,7 @@ def visible_mask(flow: np.ndarray, backward_flow: np.ndarray, w1: float = 0.01, 
     dtype = np.result_type(flow.dtype, np.float32)
     u, v = (np.ascontiguousarray(flow[..., i], dtype) for i in (0, 1))
     visible = np.empty(flow.shape[:2], np.bool_)
-    _visible_mask(u, v, flow_planes(backward_flow, dtype), w1, w2, band_edges(flow.shape[0]), visible)
+    over_rows(visible_band, flow.shape[0], u, v, flow_planes(backward_flow, dtype), float(w1), float(w2), visible)
     return visible
 
 
