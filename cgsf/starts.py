@@ -82,7 +82,7 @@ def to_batch(frames: Frames, start: SceneFlow, camera: StereoCamera | None = Non
 
     images = torch.stack([to_tensor(image) for image in (frames.left1, frames.right1, frames.left2, frames.right2)], 1)
     maps = start_maps(start)
-    homography = torch.from_numpy(find_homography(maps[0], start.backward_flow, camera))[None]
+    homography = torch.from_numpy(find_homography(maps[0], maps[1].transpose(1, 2, 0), camera))[None]
     state, backward, evidence = (torch.from_numpy(np.ascontiguousarray(each))[None] for each in maps)
     return Batch(images, None, state, backward, evidence, homography)
 
