@@ -14,6 +14,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from learned.gate_kernels import gated_change as gate_kernel
+
 # Channels of the state on left1's grid that are trusted, or not, together: D1; C, u and v. D2 lives on left2's grid.
 _GROUPS = ((0,), (2, 3, 4))
 # What counts as good: KITTI's limit.
@@ -149,6 +151,40 @@ class Neighbours:
                 total = torch.addcmul(total, weights[:, k : k + 1], other)
             means.append(total)
         return torch.cat(means, 1)
+
+
+def gated_change(state: Tensor, values: Tensor, gates: Tensor, grid: Grid) -> Tensor:
+    """What gates let in of the alternatives: the change (B, 5, H, W), in pixels.
+
+    Without a graph to build, on a CPU, a kernel does it in one pass.
+
+    Parameters
+    ----------
+    state : Tensor (B, 5, H, W)
+    values : Tensor (B, 13, h, w)
+        At the picked pixels: the neighbours' D1, C, u, v; the camera's C, u, v; the second pair's residual; what is added
+        in any case (5).
+    gates : Tensor (B, 5 divisor**2, h, w)
+        For each pixel of a block, in the order of a pixel shuffle: D1 from the neighbours, D1 from the second pair, motion
+        from the neighbours, then from the camera, C from the second pair.
+    grid : Grid
+    """
+    if state.device.type == "cpu" and state.dtype == torch.float32 and not torch.is_grad_enabled():
+        change = torch.empty(state.shape)
+        arrays = (maps.contiguous().numpy() for maps in (state, values, gates))
+        gate_kernel(*arrays, grid.divisor, change.numpy())
+        return change
+    size = state.shape[-2], state.shape[-1]
+    mixture, camera, residual, correction = grid.spread(values, size).split((4, 3, 1, 5), 1)
+    near, far, motion_near, motion_camera, change_far = (
+        F.pixel_shuffle(gates, grid.divisor)[..., : size[0], : size[1]].split(1, 1)
+    )  # fmt: skip
+    d1, motion = state[:, :1], state[:, 2:]
+    mended = near * (mixture[:, :1] - d1) + far * residual
+    moved = motion_near * (mixture[:, 1:] - motion)
+    moved = moved + motion_camera * (camera - motion - moved)
+    moved = torch.cat([moved[:, :1] + change_far * residual, moved[:, 1:]], 1)
+    return torch.cat([mended, torch.zeros_like(d1), moved], 1) + correction
 
 
 def reliability_loss(logits: Tensor, state: Tensor, truth: Tensor) -> Tensor:

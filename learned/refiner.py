@@ -15,7 +15,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from learned.alternatives import Grid, Neighbours, camera_motion, second_pair
+from learned.alternatives import Grid, Neighbours, camera_motion, gated_change, second_pair
 from learned.batch import Batch
 
 Input = Literal["state", "loss", "gradient", "deviation", "image", "evidence"]
@@ -179,9 +179,8 @@ class Refiner(nn.Module):
         reliability = self.reliability(x).float()
         preference = self.preference(x).float() - self.edge_sharpness * view.contrasts
         mixture = self.neighbours.mixture(picked, preference, reliability)
-        gates = F.pixel_shuffle(self.gates(x).float(), self.config.divisor)[..., : size[0], : size[1]].tanh()
         values = torch.cat([mixture, camera, residual, correction], 1)
-        return Update(_change(state, self.grid.spread(values, size), gates), reliability)
+        return Update(gated_change(state, values, self.gates(x).float().tanh(), self.grid), reliability)
 
     def _input(self, name: Input, view: View, picked: Tensor, batch: Batch) -> Tensor:
         """An input (B, n, h, w), scaled."""
@@ -208,18 +207,6 @@ class Refiner(nn.Module):
         """How the other pixels of a block differ from the one that stands for it."""
         block = F.pixel_unshuffle(self.grid.pad(maps), self.config.divisor)
         return block[:, :-1] - block[:, -1:]
-
-
-def _change(state: Tensor, values: Tensor, gates: Tensor) -> Tensor:
-    """What gates let in of each value, (B, 5, H, W)."""
-    mixture, camera, residual, correction = values.split((4, 3, 1, 5), 1)
-    d1, motion = state[:, :1], state[:, 2:]
-    near, far, motion_near, motion_camera, change_far = gates.split(1, 1)
-    mended = near * (mixture[:, :1] - d1) + far * residual
-    moved = motion_near * (mixture[:, 1:] - motion)
-    moved = moved + motion_camera * (camera - motion - moved)
-    moved = torch.cat([moved[:, :1] + change_far * residual, moved[:, 1:]], 1)
-    return torch.cat([mended, torch.zeros_like(d1), moved], 1) + correction
 
 
 def _backward(batch: Batch, state: Tensor) -> Tensor:

@@ -5,11 +5,11 @@ import dataclasses
 import pytest
 import torch
 
-from learned.alternatives import Grid, Neighbours, camera_motion, reliability_loss, second_pair
+from learned.alternatives import Grid, Neighbours, camera_motion, gated_change, reliability_loss, second_pair
 from learned.batch import Batch
 from learned.hybrid import Hybrid, refine
 from learned.oracle import Oracle
-from learned.refiner import COMPACT, Refiner, RefinerConfig, View, _change
+from learned.refiner import COMPACT, Refiner, RefinerConfig, View
 
 SMALL = dataclasses.replace(COMPACT, layers=((8, 1), (8, 2)), neighbours=(1, 3), steps=3)
 HEIGHT, WIDTH = 37, 51
@@ -146,7 +146,7 @@ def test_each_gate_lets_in_one_alternative(gate: int, expected: list[float]):
     values = torch.tensor([7.0, 1, 2, 3, 4, 5, 6, 20, 0, 0, 0, 0, 0])[None, :, None, None]
     gates = torch.zeros(1, 5, 1, 1)
     gates[:, gate] = 1
-    change = _change(torch.zeros(1, 5, 1, 1), values, gates)[0, :, 0, 0]
+    change = gated_change(torch.zeros(1, 5, 1, 1), values, gates, Grid(1))[0, :, 0, 0]
     assert change[1] == 0
     assert torch.equal(change[[0, 2, 3, 4]], torch.tensor(expected, dtype=torch.float32))
 
@@ -154,8 +154,21 @@ def test_each_gate_lets_in_one_alternative(gate: int, expected: list[float]):
 def test_both_motions_at_once_do_not_add_up():
     """Neighbours and camera agree on a value: a pixel that trusts both gets it once."""
     values = torch.tensor([0.0, 5, 5, 5, 5, 5, 5, 0, 0, 0, 0, 0, 0])[None, :, None, None]
-    change = _change(torch.zeros(1, 5, 1, 1), values, torch.tensor([0.0, 0, 1, 1, 0])[None, :, None, None])
+    gates = torch.tensor([0.0, 0, 1, 1, 0])[None, :, None, None]
+    change = gated_change(torch.zeros(1, 5, 1, 1), values, gates, Grid(1))
     assert torch.equal(change[0, 2:, 0, 0], torch.full((3,), 5.0))
+
+
+@pytest.mark.parametrize(("divisor", "size"), [(1, (5, 7)), (2, (5, 7)), (3, (8, 10))])
+def test_the_gates_kernel_does_what_is_written_plainly(divisor: int, size: tuple[int, int]):
+    generator = torch.Generator().manual_seed(divisor)
+    blocks = [-(-side // divisor) for side in size]
+    state = 10 * torch.randn(2, 5, *size, generator=generator)
+    values = 10 * torch.randn(2, 13, *blocks, generator=generator)
+    gates = torch.randn(2, 5 * divisor**2, *blocks, generator=generator).tanh()
+    plain = gated_change(state, values, gates, Grid(divisor))
+    with torch.no_grad():
+        assert torch.allclose(gated_change(state, values, gates, Grid(divisor)), plain, atol=1e-4)
 
 
 def test_the_cameras_energy_is_looked_at(batch: Batch):
