@@ -17,6 +17,7 @@ from variational.evidence import EvidenceConfig
 from variational.frames import Frames
 from variational.fusion import FusionConfig
 from variational.initialise import MIN_SIDE, StartName, initialise, sample
+from variational.jit import side_by_side
 from variational.matching import MatchingConfig
 from variational.objects import ObjectsConfig
 from variational.proposals import MEASURED, keep, propose
@@ -175,9 +176,10 @@ def solve(
             state, steps, reason = descend_energy(frames, state, start.backward_flow, config.descent, config.energy)
             history += steps
     with stage("visibility", 0.9):
-        backward = backward_flow(state, start.backward_flow)
-        visible = project_visibility(state)
-        matched2 = sample(start.match2.matched.astype(np.float32), flow_of(state)) > 0.5
+        backward, visible, matched2 = side_by_side(
+            lambda: backward_flow(state, start.backward_flow), lambda: project_visibility(state),
+            lambda: sample(start.match2.matched.astype(np.float32), flow_of(state)) > 0.5,
+        )  # fmt: skip
         trust = confidence(state, proposal.cost, start.match1.matched, matched2, visible)
     if progress:
         progress("done", 1.0)
