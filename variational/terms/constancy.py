@@ -71,7 +71,7 @@ def features(image: np.ndarray, config: ConstancyConfig) -> np.ndarray:
 @scalar
 def _compare(
     here: np.ndarray, other: np.ndarray, x: int, y: int, to_x: float, to_y: float, weight: float, zeta2: float, eps2: float
-) -> tuple[float, float, float, float, float, float]:
+) -> tuple[np.float32, ...]:
     """One pair at one pixel: (gxx, gxy, gyy, bx, by, E) by the position; zeros where it leads outside."""
     height, width, _ = other.shape
     zero, one = np.float32(0), np.float32(1)
