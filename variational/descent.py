@@ -8,6 +8,7 @@
 """
 
 from dataclasses import dataclass, field
+from functools import partial
 
 import cv2
 import numpy as np
@@ -15,7 +16,7 @@ import numpy as np
 from variational.energy import Energy, EnergyConfig
 from variational.frames import Frames
 from variational.initialise import Start, sample
-from variational.jit import total
+from variational.jit import side_by_side, total
 from variational.matching import MatchingConfig
 from variational.minimise import GROUPS, DescendConfig, RelaxConfig, descend, relax
 from variational.pyramid import frames_pyramid, pyramid_shapes
@@ -185,13 +186,14 @@ def refine(
     history: History = []
     if config.warps == 0:
         return state, history
-    data = Constancy(frames, constancy)
-    edges, edges2 = edge_factors(frames.grey[0]), edge_factors(frames.grey[2])
+    data, edges, edges2, seen = side_by_side(
+        partial(Constancy, frames, constancy), partial(edge_factors, frames.grey[0]), partial(edge_factors, frames.grey[2]),
+        partial(_seen, state),
+    )  # fmt: skip
     pull = np.full((*frames.shape, GROUPS), config.pull, np.float32)
     pull[..., 0][~matched[0]] = config.firm_pull
     pull[..., 1:3][rigid] = config.firm_pull
     pull[..., 3][~matched[1]] = config.firm_pull
-    seen = _seen(state)
     corrected = state
     for iteration in range(config.warps):
         relaxed, energy = relax(corrected, state, data.systems(corrected, seen), edges, edges2, pull, config.relax)

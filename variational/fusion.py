@@ -8,12 +8,13 @@ of the image. The labelling minimises this along a tree at every pixel (rows fir
 """
 
 from dataclasses import dataclass
+from functools import partial
 
 import cv2
 import numpy as np
 
 from variational.census import BITS, popcount
-from variational.jit import inlined, over_bands, over_rows, rowwise
+from variational.jit import inlined, over_bands, over_rows, rowwise, side_by_side
 
 STRIP = 192
 """Columns that a chain works on at a time: their candidates and costs of two rows stay in the nearest cache, and what
@@ -267,10 +268,9 @@ def choose(
     turned = _transposed(costs)
     rows, trees = np.empty_like(turned), np.empty_like(costs)
     height, width = grey.shape
-    price = cv2.transpose(_price(disparity, grey, 1, config))
-    over_bands(_chains, _strips(height), _transposed(candidates), turned, price, inverse_scale, rows)
-    price = _price(disparity, grey, 0, config)
-    over_bands(_chains, _strips(width), candidates, _transposed(rows), price, inverse_scale, trees)
+    along, down = side_by_side(*(partial(_price, disparity, grey, axis, config) for axis in (1, 0)))
+    over_bands(_chains, _strips(height), _transposed(candidates), turned, cv2.transpose(along), inverse_scale, rows)
+    over_bands(_chains, _strips(width), candidates, _transposed(rows), down, inverse_scale, trees)
     labels = np.empty(grey.shape, np.int32)
     over_rows(_cheapest, len(labels), trees, labels)
     return labels

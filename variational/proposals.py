@@ -66,7 +66,7 @@ def correspondences(start: Start, tolerance_px: float = 1.0) -> Correspondences:
     return Correspondences(np.dstack([x, y, start.state[D1]]), np.dstack([to_x, to_y, second_disparity]), valid)
 
 
-def _nearby(motions: list[RigidMotion], slots: int = 3) -> np.ndarray:
+def _nearby(motions: list[RigidMotion], slots: int) -> np.ndarray:
     """(slots, H, W) int: the objects nearest to each pixel, nearest first, MEASURED where there are none near.
 
     Near is within half of the object's own size: what moves with it but could not be matched lies around it.
@@ -149,9 +149,10 @@ def propose(
     words = (start.match1.words_left, start.match2.words_left, start.match2.words_right)
     state = start.state.copy()
 
-    def fuse() -> tuple[np.ndarray, np.ndarray]:
+    def fuse(objects_near: int) -> tuple[np.ndarray, np.ndarray]:
         """Labels and costs under the motions so far; writes the chosen motion to the state."""
-        labels_of = np.concatenate([np.array([MEASURED, 0])[:, None, None] + np.zeros_like(nothing), _nearby(motions)])
+        everywhere = np.array([MEASURED, 0])[:, None, None] + np.zeros_like(nothing)
+        labels_of = np.concatenate([everywhere, _nearby(motions, objects_near)])
         candidates = _candidates(state, start, motions, labels_of)
         costs = motion_costs(candidates, state[D1], words, fusion)
         biased = costs.copy()
@@ -162,14 +163,14 @@ def propose(
         return labels, cost
 
     nothing = keep(start).labels
-    labels, cost = fuse()
+    labels, cost = fuse(1)
     if not evidence.fill:
         return Proposal(state, labels, motions, cost)
     surfaces = unexplained_surfaces(state[D1], cost, project_visibility(state), objects)
     motions += find_objects(start, state[D1], grey, landmarks2, surfaces, known.projection(), objects)
     homographies = np.stack([motion.homography for motion in motions])
     state[D1] = refill(start.match1, start.match2, grey, labels, homographies, matching, evidence)
-    labels, cost = fuse()
+    labels, cost = fuse(2)
     return Proposal(state, labels, motions, cost)
 
 

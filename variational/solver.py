@@ -17,6 +17,7 @@ from variational.evidence import EvidenceConfig
 from variational.frames import Frames
 from variational.fusion import FusionConfig
 from variational.initialise import MIN_SIDE, StartName, initialise, sample
+from variational.jit import side_by_side
 from variational.matching import MatchingConfig
 from variational.objects import ObjectsConfig
 from variational.proposals import MEASURED, keep, propose
@@ -39,9 +40,9 @@ class SolverConfig:
     start : {"matching", "opencv", "zero"}
         Starting state: our census matching and dense inverse search, OpenCV's matching and the same flow, or nothing,
         from which a coarse-to-fine minimisation begins.
-    size : float
-        Sides of the images that all is done on, relative to those given, in (0, 1]; 0.5 takes a quarter of the time and
-        loses what is two pixels thin.
+    most_pixels : int
+        Larger images are worked on at a size of about so many pixels, which bounds the time and loses what is thin; 0 for
+        no such limit.
     proposals : bool
         Fuse the start with rigid motions (variational.proposals).
     matching, rigid, objects, fusion, evidence, from_zero, refine, constancy
@@ -51,7 +52,7 @@ class SolverConfig:
     """
 
     start: StartName = "matching"
-    size: float = 1.0
+    most_pixels: int = 0
     proposals: bool = True
     matching: MatchingConfig = field(default_factory=MatchingConfig)
     rigid: RigidConfig = field(default_factory=RigidConfig)
@@ -65,8 +66,8 @@ class SolverConfig:
     energy: EnergyConfig = field(default_factory=EnergyConfig)
 
     def __post_init__(self) -> None:
-        if not 0 < self.size <= 1:
-            raise ValueError(f"SolverConfig.size must be in (0, 1], got {self.size}")
+        if self.most_pixels < 0:
+            raise ValueError(f"SolverConfig.most_pixels must not be negative, got {self.most_pixels}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,9 +138,10 @@ def solve(
     height, width = frames.left1.shape[:2]
     if min(height, width) < MIN_SIDE:
         raise ValueError(f"images of {width} x {height} pixels are too small: the solver needs {MIN_SIDE} on every side")
-    size = max(config.size, MIN_SIDE / min(height, width))
-    if size < 1:
-        return _solve_smaller(frames, replace(config, size=1.0), camera, progress, (round(height * size), round(width * size)))
+    if 0 < config.most_pixels < height * width:
+        size = max(np.sqrt(config.most_pixels / (height * width)), MIN_SIDE / min(height, width))
+        shape = (round(height * size), round(width * size))
+        return _solve_smaller(frames, replace(config, most_pixels=0), camera, progress, shape)
     seconds: dict[str, float] = {}
 
     @contextmanager
@@ -175,9 +177,10 @@ def solve(
             state, steps, reason = descend_energy(frames, state, start.backward_flow, config.descent, config.energy)
             history += steps
     with stage("visibility", 0.9):
-        backward = backward_flow(state, start.backward_flow)
-        visible = project_visibility(state)
-        matched2 = sample(start.match2.matched.astype(np.float32), flow_of(state)) > 0.5
+        backward, visible, matched2 = side_by_side(
+            lambda: backward_flow(state, start.backward_flow), lambda: project_visibility(state),
+            lambda: sample(start.match2.matched.astype(np.float32), flow_of(state)) > 0.5,
+        )  # fmt: skip
         trust = confidence(state, proposal.cost, start.match1.matched, matched2, visible)
     if progress:
         progress("done", 1.0)

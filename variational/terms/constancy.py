@@ -23,6 +23,8 @@ import numpy as np
 from variational.frames import Frames
 from variational.jit import over_rows, rowwise, scalar
 
+FEATURES = 3
+"""Channels of :func:`features`."""
 SYSTEM = 18
 """Numbers a pixel: 10 of A (upper triangle, by rows), 4 of b, then A and b of D2, E of both."""
 
@@ -68,19 +70,18 @@ def features(image: np.ndarray, config: ConstancyConfig) -> np.ndarray:
 
 @scalar
 def _compare(
-    here: np.ndarray, other: np.ndarray, x: int, y: int, to_x: float, to_y: float, weight: float, zeta2: float, eps2: float,
-    out: np.ndarray,
-) -> bool:  # fmt: skip
-    """One pair at one pixel; out = (gxx, gxy, gyy, bx, by, E) by the position. False where it leads outside."""
-    height, width, count = other.shape
+    here: np.ndarray, other: np.ndarray, x: int, y: int, to_x: float, to_y: float, weight: float, zeta2: float, eps2: float
+) -> tuple[np.float32, ...]:
+    """One pair at one pixel: (gxx, gxy, gyy, bx, by, E) by the position; zeros where it leads outside."""
+    height, width, _ = other.shape
+    zero, one = np.float32(0), np.float32(1)
     if not (0 <= to_x <= width - 1 and 0 <= to_y <= height - 1):
-        return False
+        return zero, zero, zero, zero, zero, zero
     i, j = min(int(to_x), max(width - 2, 0)), min(int(to_y), max(height - 2, 0))
     i1, j1 = min(i + 1, width - 1), min(j + 1, height - 1)
     fx, fy = to_x - np.float32(i), to_y - np.float32(j)
-    one = np.float32(1)
-    gxx = gxy = gyy = bx = by = energy = np.float32(0)
-    for k in range(count):
+    gxx = gxy = gyy = bx = by = energy = zero
+    for k in range(FEATURES):  # a constant, so that the loop is unrolled
         v00, v01, v10, v11 = other[j, i, k], other[j, i1, k], other[j1, i, k], other[j1, i1, k]
         top, bottom = v00 + fx * (v01 - v00), v10 + fx * (v11 - v10)
         dx, dy = (one - fy) * (v01 - v00) + fy * (v11 - v10), bottom - top
@@ -95,8 +96,7 @@ def _compare(
         by += theta * dy * residual
     root = np.sqrt(energy + eps2)
     scale = weight / root
-    out[0], out[1], out[2], out[3], out[4], out[5] = scale * gxx, scale * gxy, scale * gyy, scale * bx, scale * by, weight * root
-    return True
+    return scale * gxx, scale * gxy, scale * gyy, scale * bx, scale * by, weight * root
 
 
 @rowwise
@@ -106,7 +106,6 @@ def _systems(
     systems: np.ndarray,
 ) -> None:  # fmt: skip
     _, height, width = state.shape
-    pair = np.empty(6, np.float32)
     for y in range(first, last):
         for x in range(width):
             s = systems[y, x]
@@ -114,35 +113,37 @@ def _systems(
             d1, d2, change = state[0, y, x], state[1, y, x], state[2, y, x]
             px, py = np.float32(x), np.float32(y)  # an integer plus a float32 would be float64
             to_x, to_y = px + state[3, y, x], py + state[4, y, x]
-            if seen_right1[y, x] and _compare(left1, right1, x, y, px - d1, py, weights[0], zeta2, eps2, pair):
-                s[0] += pair[0]
-                s[10] -= pair[3]
-                s[16] += pair[5]
+            if seen_right1[y, x]:
+                gxx, _, _, bx, _, e = _compare(left1, right1, x, y, px - d1, py, weights[0], zeta2, eps2)
+                s[0] += gxx
+                s[10] -= bx
+                s[16] += e
             if seen_left2[y, x]:
-                if _compare(left1, left2, x, y, to_x, to_y, weights[1], zeta2, eps2, pair):
-                    s[7] += pair[0]
-                    s[8] += pair[1]
-                    s[9] += pair[2]
-                    s[12] += pair[3]
-                    s[13] += pair[4]
-                    s[16] += pair[5]
-                if _compare(left1, right2, x, y, to_x - d1 - change, to_y, weights[2], zeta2, eps2, pair):
-                    # the position's x moves by -1, -1, +1, 0 with D1, C, u, v; its y with v alone
-                    s[0] += pair[0]
-                    s[1] += pair[0]
-                    s[2] -= pair[0]
-                    s[3] -= pair[1]
-                    s[4] += pair[0]
-                    s[5] -= pair[0]
-                    s[6] -= pair[1]
-                    s[7] += pair[0]
-                    s[8] += pair[1]
-                    s[9] += pair[2]
-                    s[10] -= pair[3]
-                    s[11] -= pair[3]
-                    s[12] += pair[3]
-                    s[13] += pair[4]
-                    s[16] += pair[5]
+                gxx, gxy, gyy, bx, by, e = _compare(left1, left2, x, y, to_x, to_y, weights[1], zeta2, eps2)
+                s[7] += gxx
+                s[8] += gxy
+                s[9] += gyy
+                s[12] += bx
+                s[13] += by
+                s[16] += e
+                to_right = to_x - d1 - change
+                gxx, gxy, gyy, bx, by, e = _compare(left1, right2, x, y, to_right, to_y, weights[2], zeta2, eps2)
+                # the position's x moves by -1, -1, +1, 0 with D1, C, u, v; its y with v alone
+                s[0] += gxx
+                s[1] += gxx
+                s[2] -= gxx
+                s[3] -= gxy
+                s[4] += gxx
+                s[5] -= gxx
+                s[6] -= gxy
+                s[7] += gxx
+                s[8] += gxy
+                s[9] += gyy
+                s[10] -= bx
+                s[11] -= bx
+                s[12] += bx
+                s[13] += by
+                s[16] += e
                 if 0 <= to_x <= width - 1 and 0 <= to_y <= height - 1:
                     i, j = min(int(to_x), max(width - 2, 0)), min(int(to_y), max(height - 2, 0))
                     i1, j1 = min(i + 1, width - 1), min(j + 1, height - 1)
@@ -168,10 +169,11 @@ def _systems(
                     s[12] -= scale * dx * residual
                     s[13] -= scale * dy * residual
                     s[16] += weights[3] * root
-            if seen_right2[y, x] and _compare(left2, right2, x, y, px - d2, py, weights[0], zeta2, eps2, pair):
-                s[14] += pair[0]
-                s[15] -= pair[3]
-                s[17] += pair[5]
+            if seen_right2[y, x]:
+                gxx, _, _, bx, _, e = _compare(left2, right2, x, y, px - d2, py, weights[0], zeta2, eps2)
+                s[14] += gxx
+                s[15] -= bx
+                s[17] += e
 
 
 class Constancy:
