@@ -60,7 +60,7 @@ def refine(
     if oracle is None and (refiner.config.needs_energy or watch):
         oracle = Oracle(*batch.frames, batch.backward_flow)
     camera_loss = None
-    if refiner.config.neighbours and steps > 0:
+    if refiner.config.weighs_energies and steps > 0:
         assert oracle is not None
         camera_loss, _ = oracle.features(still(batch.start, batch.homography))
     contrasts = refiner.contrasts(batch)

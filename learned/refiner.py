@@ -68,13 +68,18 @@ class RefinerConfig:
     def channels(self) -> int:
         """Input channels."""
         count = {"state": 5, "loss": 1, "gradient": 5, "deviation": 5, "image": 6, "evidence": self.evidence}
-        beside = 2 * (self.divisor**2 - 1) + 6 if self.neighbours else 0
+        beside = 2 * (self.divisor**2 - 1) + 5 + self.weighs_energies if self.neighbours else 0
         return sum(count[name] for name in self.inputs) + beside
 
     @property
     def needs_energy(self) -> bool:
         """Whether the energy must be evaluated at all."""
-        return bool(self.neighbours) or "loss" in self.inputs or "gradient" in self.inputs
+        return "loss" in self.inputs or "gradient" in self.inputs
+
+    @property
+    def weighs_energies(self) -> bool:
+        """Whether it compares the energy of the state with that of a camera that moves past a standing world."""
+        return bool(self.neighbours) and "loss" in self.inputs
 
 
 #: For a CPU: every second pixel, a field of view of about 100 pixels, neighbours at two distances. What it sees has no
@@ -151,7 +156,7 @@ class Refiner(nn.Module):
         Parameters
         ----------
         view : View
-            Energy and gradient if they are inputs; camera_loss and contrasts with neighbours.
+            Energy and gradient if they are inputs; with neighbours the contrasts, and the camera's energy if energy is an input.
         batch : Batch
             Its images if they are an input, its evidence if that is one; with neighbours its backward flow and the camera's
             motion (without it, the state's own).
@@ -163,24 +168,31 @@ class Refiner(nn.Module):
         if not self.config.neighbours:
             correction = self.correction(self.hidden(torch.cat(features, 1))).float()
             return Update(self.grid.spread(correction, size), None)
-        coordinates = self.grid.coordinates(picked)
-        residual, round_trip = second_pair(picked, coordinates, state[:, 1:2], _backward(batch, state))
-        camera = picked[:, 2:]
-        if batch.homography is not None:
-            camera = camera_motion(picked[:, 0], coordinates, batch.homography)
-        assert view.camera_loss is not None
-        assert view.loss is not None
-        assert view.contrasts is not None
-        rise = self._mean((view.camera_loss - view.loss)[:, None])
-        features += [_signed_log(maps) for maps in (camera - picked[:, 2:], residual, round_trip, rise)]
-        features += [_signed_log(self._within(state[:, channel : channel + 1], picked)) for channel in (0, 3)]
+        camera, residual, beside = self._alternatives(view, picked, batch)
+        features += [_signed_log(maps) for maps in beside]
         x = self.hidden(torch.cat(features, 1))
         correction = _CORRECTION_MOST_PX * (self.correction(x).float() / _CORRECTION_MOST_PX).tanh()
         reliability = self.reliability(x).float()
+        assert view.contrasts is not None
         preference = self.preference(x).float() - self.edge_sharpness * view.contrasts
         mixture = self.neighbours.mixture(picked, preference, reliability)
         values = torch.cat([mixture, camera, residual, correction], 1)
         return Update(gated_change(state, values, self.gates(x).float().tanh(), self.grid), reliability)
+
+    def _alternatives(self, view: View, picked: Tensor, batch: Batch) -> tuple[Tensor, Tensor, list[Tensor]]:
+        """The camera's motion (B, 3, h, w), the second pair's residual (B, 1, h, w), and all that tells whom to trust."""
+        state, coordinates = view.state, self.grid.coordinates(picked)
+        backward_flow = -state[:, 3:] if batch.backward_flow is None else batch.backward_flow
+        residual, round_trip = second_pair(picked, coordinates, state[:, 1:2], backward_flow)
+        camera = picked[:, 2:]
+        if batch.homography is not None:
+            camera = camera_motion(picked[:, 0], coordinates, batch.homography)
+        beside = [camera - picked[:, 2:], residual, round_trip]
+        if self.config.weighs_energies:
+            assert view.camera_loss is not None
+            assert view.loss is not None
+            beside.append(self._mean((view.camera_loss - view.loss)[:, None]))
+        return camera, residual, beside + [self._within(state[:, channel : channel + 1]) for channel in (0, 3)]
 
     def _input(self, name: Input, view: View, picked: Tensor, batch: Batch) -> Tensor:
         """An input (B, n, h, w), scaled."""
@@ -203,14 +215,10 @@ class Refiner(nn.Module):
         """Mean over each block."""
         return F.avg_pool2d(self.grid.pad(maps), self.config.divisor) if self.config.divisor > 1 else maps
 
-    def _within(self, maps: Tensor, picked: Tensor) -> Tensor:
+    def _within(self, maps: Tensor) -> Tensor:
         """How the other pixels of a block differ from the one that stands for it."""
         block = F.pixel_unshuffle(self.grid.pad(maps), self.config.divisor)
         return block[:, :-1] - block[:, -1:]
-
-
-def _backward(batch: Batch, state: Tensor) -> Tensor:
-    return -state[:, 3:] if batch.backward_flow is None else batch.backward_flow
 
 
 def _deviation(state: Tensor, side: int) -> Tensor:
