@@ -19,8 +19,6 @@ from variational.matching import MatchingConfig, StereoMatch, census, fill_backg
 StartName = Literal["matching", "opencv", "zero"]
 MIN_SIDE = 16
 """Smallest image side, in pixels, that matching and flow accept."""
-MIN_COARSE_SIDE = 96
-"""Smallest image side for the coarse flow, which ends at a quarter of the size: OpenCV crashes where that leaves no patch."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,10 +54,9 @@ def sample(plane: np.ndarray, flow: np.ndarray) -> np.ndarray:
     return cv2.remap(plane, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
 
-def dense_inverse_search(first: np.ndarray, second: np.ndarray, fine: bool = True) -> np.ndarray:
-    """(H, W, 2) float32 flow from one grey image to another; one that is not `fine` takes a quarter of the time."""
-    fine = fine or min(first.shape) < MIN_COARSE_SIDE
-    search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM if fine else cv2.DISOPTICAL_FLOW_PRESET_FAST)
+def dense_inverse_search(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """(H, W, 2) float32 flow from one grey image to another."""
+    search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     return search.calc(to_bytes(first), to_bytes(second), None)
 
 
@@ -104,7 +101,7 @@ def initialise(frames: Frames, name: StartName, config: MatchingConfig) -> Start
     pair = matching if name == "matching" else partial(opencv_match, searched=searched)
     match1, match2, flow, backward = side_by_side(
         partial(pair, left1, right1), partial(pair, left2, right2),
-        partial(dense_inverse_search, left1, left2), partial(dense_inverse_search, left2, left1, fine=False),
+        partial(dense_inverse_search, left1, left2), partial(dense_inverse_search, left2, left1),
     )  # fmt: skip
     change = sample(match2.disparity, flow) - match1.disparity
     state = np.stack([match1.disparity, match2.disparity, change, flow[..., 0], flow[..., 1]])
