@@ -8,7 +8,8 @@ from variational.camera import StereoCamera
 from variational.initialise import sample
 from variational.rigid import Correspondences, RigidConfig, find_motions, guess_camera
 
-_CAMERA_ALONE = RigidConfig(max_objects=0)
+# A quarter of the solver's points: six numbers are sought, among candidates that a step of the refiner weighs again.
+_CAMERA_ALONE = RigidConfig(max_objects=0, points=1000)
 # Flow there and back must agree this well for a pixel to tell anything about the camera, in pixels.
 _ROUND_TRIP_PX = 1.0
 

@@ -156,9 +156,11 @@ def load_networks(config: FeedforwardConfig) -> FeedforwardModule:
 
 def load_refiner(name: str) -> Refiner:
     """A refiner from weights that ship or a file; `InputError` for anything else."""
+    import torch
+
     from learned.refiner import Refiner
 
     net: nn.Module = load_network(name)
     if not isinstance(net, Refiner):
         raise InputError(f"{name} holds the weights of a {type(net).__name__}, not of a refiner")
-    return net
+    return net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]

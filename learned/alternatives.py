@@ -96,7 +96,7 @@ def second_pair(state: Tensor, coordinates: tuple[Tensor, Tensor], d2: Tensor, b
     source = torch.cat([d2, backward_flow.to(d2.dtype)], 1)
     there = F.grid_sample(source, positions, mode="bilinear", padding_mode="border", align_corners=True)
     residual = there[:, :1] - state[:, :1] - state[:, 2:3]
-    return residual, (state[:, 3:] + there[:, 1:]).norm(dim=1, keepdim=True)
+    return residual, torch.hypot(state[:, 3:4] + there[:, 1:2], state[:, 4:] + there[:, 2:])
 
 
 class Neighbours:
