@@ -18,6 +18,8 @@ from learned.gate_kernels import gated_change as gate_kernel
 
 # Channels of the state on left1's grid that are trusted, or not, together: D1; C, u and v. D2 lives on left2's grid.
 _GROUPS = ((0,), (2, 3, 4))
+# Ratio of depths at time 2 and 1 below which a point is as good as behind the camera.
+_LEAST_SCALE = 0.05
 # What counts as good: KITTI's limit.
 _GOOD_PX = 3.0
 _DIRECTIONS = [(dy, dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1) if dy or dx]
@@ -52,23 +54,27 @@ class Grid(NamedTuple):
         return columns * self.divisor + last, rows[:, None] * self.divisor + last
 
 
-def camera_motion(disparity: Tensor, coordinates: tuple[Tensor, Tensor], homography: Tensor) -> Tensor:
+def camera_motion(state: Tensor, coordinates: tuple[Tensor, Tensor], homography: Tensor) -> Tensor:
     """C, u and v (B, 3, h, w), in pixels, of points that stand still while the camera moves.
+
+    Points that would come to lie behind the camera, or nearly, keep the motion that they have: a gate that is hardly
+    open would still let in a part of a motion without bounds.
 
     Parameters
     ----------
-    disparity : Tensor (B, h, w)
-        Of left1, pixels.
+    state : Tensor (B, 5, h, w)
+        Pixels; its D1 says where the points are.
     coordinates : (Tensor, Tensor)
         The pixels' columns and rows, in any shapes that broadcast to (h, w).
     homography : Tensor (B, 4, 4)
         The camera's motion on (x, y, disparity, 1), float64.
     """
     x, y = coordinates
-    h = homography.to(disparity.dtype)[..., None, None]
+    disparity, h = state[:, 0], homography.to(state.dtype)[..., None, None]
     moved = [h[:, i, 2] * disparity + (h[:, i, 0] * x + h[:, i, 1] * y + h[:, i, 3]) for i in range(4)]
-    scale = 1 / moved[3].clamp(min=1e-3)
-    return torch.stack([moved[2] * scale - disparity, moved[0] * scale - x, moved[1] * scale - y], 1)
+    scale = 1 / moved[3].clamp(min=_LEAST_SCALE)
+    motion = torch.stack([moved[2] * scale - disparity, moved[0] * scale - x, moved[1] * scale - y], 1)
+    return torch.where(moved[3][:, None] > _LEAST_SCALE, motion, state[:, 2:])
 
 
 def second_pair(state: Tensor, coordinates: tuple[Tensor, Tensor], d2: Tensor, backward_flow: Tensor) -> tuple[Tensor, Tensor]:

@@ -83,7 +83,7 @@ def still(state: Tensor, homography: Tensor | None) -> Tensor:
     """The state (B, 5, H, W) if nothing moved but the camera, by its homography (B, 4, 4); None leaves it as it is."""
     if homography is None:
         return state
-    motion = camera_motion(state[:, 0], Grid(1).coordinates(state), homography)
+    motion = camera_motion(state, Grid(1).coordinates(state), homography)
     return torch.cat([state[:, :2], motion], 1)
 
 

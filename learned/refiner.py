@@ -188,7 +188,7 @@ class Refiner(nn.Module):
         residual, round_trip = second_pair(picked, coordinates, state[:, 1:2], backward_flow)
         camera = picked[:, 2:]
         if batch.homography is not None:
-            camera = camera_motion(picked[:, 0], coordinates, batch.homography)
+            camera = camera_motion(picked, coordinates, batch.homography)
         beside = [camera - picked[:, 2:], residual, round_trip]
         if self.config.weighs_energies:
             assert view.camera_loss is not None

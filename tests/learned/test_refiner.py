@@ -119,15 +119,26 @@ def test_camera_motion_of_a_turn_and_a_step():
     """A homography that adds to x and y and scales the disparity, at asymmetric sizes and picked pixels."""
     homography = torch.eye(4, dtype=torch.float64)[None]
     homography[0, 0, 3], homography[0, 1, 3], homography[0, 2, 2] = 3.0, -2.0, 1.25
-    change, u, v = camera_motion(torch.full((1, 4, 6), 8.0), Grid(2).coordinates(torch.empty(4, 6)), homography)[0]
+    change, u, v = camera_motion(torch.full((1, 5, 4, 6), 8.0), Grid(2).coordinates(torch.empty(4, 6)), homography)[0]
     assert torch.allclose(change, torch.tensor(2.0))
     assert torch.allclose(u, torch.tensor(3.0))
     assert torch.allclose(v, torch.tensor(-2.0))
     homography[0, 3, 3] = 2.0  # everything twice as far from the origin's projection
     x, y = Grid(1).coordinates(torch.empty(4, 6))
-    _, u, v = camera_motion(torch.full((1, 4, 6), 8.0), (x, y), homography)[0]
+    _, u, v = camera_motion(torch.full((1, 5, 4, 6), 8.0), (x, y), homography)[0]
     assert torch.allclose(u, ((x + 3) / 2 - x).expand(4, 6))
     assert torch.allclose(v, ((y - 2) / 2 - y).expand(4, 6))
+
+
+def test_points_behind_the_camera_keep_their_motion():
+    """However open a gate is, nothing unbounded comes through it."""
+    homography = torch.eye(4, dtype=torch.float64)[None]
+    homography[0, 3, 2] = -0.125  # depth falls to nothing at disparity 8
+    state = torch.randn(1, 5, 4, 6, generator=torch.Generator().manual_seed(2))
+    state[:, 0] = torch.tensor([1.0, 7.9, 8.0, 8.1, 9.0, 100.0])
+    motion = camera_motion(state, Grid(1).coordinates(state), homography)
+    assert torch.equal(motion[..., 1:], state[:, 2:, :, 1:])
+    assert not torch.allclose(motion[..., 0], state[:, 2:, :, 0])
 
 
 def test_second_pair_is_looked_up_where_the_flow_leads_to():
