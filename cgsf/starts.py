@@ -84,7 +84,7 @@ def to_batch(frames: Frames, start: SceneFlow, camera: StereoCamera | None = Non
     maps = start_maps(start)
     homography = torch.from_numpy(find_homography(maps[0], maps[1].transpose(1, 2, 0), camera))[None]
     state, backward, evidence = (torch.from_numpy(np.ascontiguousarray(each))[None] for each in maps)
-    return Batch(images, None, state, backward, evidence, homography)
+    return Batch(images, None, state, backward, evidence, homography=homography)
 
 
 def describe(config: StartConfig) -> dict[str, Any]:

@@ -73,12 +73,11 @@ def train(recipe: Recipe, folder: str | Path, seconds: float = float("inf"), pro
     cache = SampleCache(recipe.cache)
     if len(cache) <= recipe.held_out:
         raise InputError(f"{recipe.cache}: {len(cache)} samples, of which {recipe.held_out} are held out: none to train with")
-    starts = StartCache(recipe.starts) if recipe.stage == "refiner" or recipe.cached_networks else None
-    if starts and starts.names != cache.names[: len(starts)]:
-        raise InputError(f"{recipe.starts} was made from other samples than those of {recipe.cache}")
+    starts = _starts(recipe.starts, cache) if recipe.stage == "refiner" or recipe.cached_networks else None
+    rivals = _starts(recipe.rivals, cache) if recipe.stage == "refiner" and recipe.refiner.rival else None
     if recipe.starts and recipe.stage == "joint" and not starts:
         raise InputError('starts take the place of networks that are frozen, as training.frozen = ["feedforward"]')
-    batches = Batches(recipe, cache, starts)
+    batches = Batches(recipe, cache, starts, rivals)
     if batches.count < 1:
         raise InputError(f"{recipe.cache}: all of its samples are held out ({recipe.held_out}): none to train with")
     check_truth(recipe, cache)
@@ -97,9 +96,11 @@ def train(recipe: Recipe, folder: str | Path, seconds: float = float("inf"), pro
 class Batches:
     """``batch_at`` over a cache: every pass shuffles anew, every draw depends on the index alone."""
 
-    def __init__(self, recipe: Recipe, cache: SampleCache, starts: StartCache | None = None) -> None:
-        self.recipe, self.cache, self.starts = recipe, cache, starts
-        self.count = min(len(cache), len(cache) if starts is None else len(starts)) - recipe.held_out
+    def __init__(
+        self, recipe: Recipe, cache: SampleCache, starts: StartCache | None = None, rivals: StartCache | None = None
+    ) -> None:
+        self.recipe, self.cache, self.starts, self.rivals = recipe, cache, starts, rivals
+        self.count = min(len(source) for source in (cache, starts, rivals) if source is not None) - recipe.held_out
 
     def __call__(self, index: int) -> Batch:
         recipe, seed = self.recipe, self.recipe.training.seed
@@ -117,8 +118,9 @@ class Batches:
         if self.starts is None:
             return Batch(images, truth, names=names)
         known = {name: torch.from_numpy(np.array(array)[None]) for name, array in self.starts[index].items()}
+        rival = None if self.rivals is None else torch.from_numpy(np.array(self.rivals[index]["start"])[None])
         return Batch(
-            images, truth, known["start"], known["backward"], known["evidence"], known["homography"], names
+            images, truth, known["start"], known["backward"], known["evidence"], rival, known["homography"], names
         )  # fmt: skip
 
     def held_out(self) -> Iterator[Batch]:
@@ -126,6 +128,13 @@ class Batches:
         for index in range(self.recipe.held_out):
             sample = self.sample(index)
             yield replace(sample, images=sample.images.float() / 255)
+
+
+def _starts(folder: str, cache: SampleCache) -> StartCache:
+    starts = StartCache(folder)
+    if starts.names != cache.names[: len(starts)]:
+        raise InputError(f"{folder} was made from other samples than those of {cache.folder}")
+    return starts
 
 
 def check_truth(recipe: Recipe, cache: SampleCache) -> None:

@@ -117,6 +117,7 @@ def resized(batch: Batch, size: tuple[int, int]) -> Batch:
         start=nearest(batch.start, factors),
         backward_flow=nearest(batch.backward_flow, factors[3:]),
         evidence=nearest(batch.evidence, None),
+        rival=nearest(batch.rival, factors),
     )
 
 
@@ -139,6 +140,7 @@ def _mirrored(batch: Batch) -> Batch:
         start=flip(batch.start, 4),
         backward_flow=flip(batch.backward_flow, 1),
         evidence=flip(batch.evidence, None),
+        rival=flip(batch.rival, 4),
     )
 
 

@@ -15,7 +15,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from learned.alternatives import Grid, Neighbours, camera_motion, gated_change, second_pair
+from learned.alternatives import Grid, Neighbours, adopted_change, camera_motion, gated_change, second_pair
 from learned.batch import Batch
 
 Input = Literal["state", "loss", "gradient", "deviation", "image", "evidence"]
@@ -28,8 +28,8 @@ _SURROUNDINGS_PX = 16  # side of the box that the deviation is measured against
 # Affinity of neighbours falls by this factor's exponential with their difference in intensity, before training.
 _EDGE_SHARPNESS = 10.0
 # Gates: D1 from its neighbours and from the second pair, motion from its neighbours and the camera's, C from the second
-# pair.
-_GATES = 5
+# pair; then both disparities and motion from the rival.
+_GATES, _RIVAL_GATES = 5, 2
 _CORRECTION_MOST_PX = 4.0  # a step; larger changes need somebody who vouches for them
 
 
@@ -50,6 +50,8 @@ class RefinerConfig:
     neighbours: tuple[int, ...] = ()
     """Distances, in blocks, of neighbours whose values a pixel may take over, as those of the camera's motion and of the
     second pair; empty as published: corrections alone."""
+    rival: bool = False
+    """Whether a pixel may take over a rival's values too: another method's state (`Batch.rival`)."""
     detached: bool = False
     """Each step learns from its own loss alone, none through the steps before: a half of the training time."""
     steps: int = 5
@@ -61,6 +63,8 @@ class RefinerConfig:
             raise ValueError(f"inputs must be different ones of {', '.join(get_args(Input))}; got {self.inputs}")
         if (self.evidence > 0) != ("evidence" in self.inputs):
             raise ValueError("evidence must count the channels of the input 'evidence', 0 without it")
+        if self.rival and not (self.neighbours and "loss" in self.inputs):
+            raise ValueError("a refiner with a rival must have neighbours, and the energy's map among its inputs, to compare")
         if self.divisor < 1 or self.steps < 0 or not self.layers or any(distance < 1 for distance in self.neighbours):
             raise ValueError("divisor and distances must be at least 1, steps not negative, and there must be a hidden layer")
 
@@ -68,7 +72,7 @@ class RefinerConfig:
     def channels(self) -> int:
         """Input channels."""
         count = {"state": 5, "loss": 1, "gradient": 5, "deviation": 5, "image": 6, "evidence": self.evidence}
-        beside = 2 * (self.divisor**2 - 1) + 5 + self.weighs_energies if self.neighbours else 0
+        beside = 2 * (self.divisor**2 - 1) + 5 + self.weighs_energies + 7 * self.rival if self.neighbours else 0
         return sum(count[name] for name in self.inputs) + beside
 
     @property
@@ -104,6 +108,8 @@ class View(NamedTuple):
     """(B, 5, H, W): of the energy."""
     camera_loss: Tensor | None = None
     """(B, H, W): the energy's map if everything followed the camera's motion."""
+    rival_losses: Tensor | None = None
+    """(B, 2, H, W): the energy's map with the rival's disparities, and with its motion."""
     contrasts: Tensor | None = None
     """(B, k, h, w): of left1, between neighbours."""
 
@@ -139,7 +145,7 @@ class Refiner(nn.Module):
             self.neighbours = Neighbours(config.neighbours)
             self.reliability = nn.Conv2d(channels, 2, 1)
             self.preference = nn.Conv2d(channels, len(self.neighbours.offsets), 1)
-            self.gates = nn.Conv2d(channels, _GATES * config.divisor**2, 1)
+            self.gates = nn.Conv2d(channels, (_GATES + _RIVAL_GATES * config.rival) * config.divisor**2, 1)
             self.edge_sharpness = nn.Parameter(torch.tensor(_EDGE_SHARPNESS))
             heads += [self.reliability, self.preference, self.gates]
         for layer in heads:
@@ -179,7 +185,13 @@ class Refiner(nn.Module):
         preference = preference - self.edge_sharpness * view.contrasts
         mixture = self.neighbours.mixture(picked, preference, reliability)
         values = torch.cat([mixture, camera, residual, correction], 1)
-        return Update(gated_change(state, values, gates.tanh(), self.grid), reliability)
+        own = _GATES * self.config.divisor**2
+        gates, rival_gates = gates.tanh().tensor_split((own,), 1)
+        change = gated_change(state, values, gates, self.grid)
+        if self.config.rival:
+            assert batch.rival is not None
+            change = adopted_change(change, state, batch.rival, rival_gates, self.grid)
+        return Update(change, reliability)
 
     def _alternatives(self, view: View, picked: Tensor, batch: Batch) -> tuple[Tensor, Tensor, list[Tensor]]:
         """The camera's motion (B, 3, h, w), the second pair's residual (B, 1, h, w), and all that tells whom to trust."""
@@ -194,6 +206,11 @@ class Refiner(nn.Module):
             assert view.camera_loss is not None
             assert view.loss is not None
             beside.append(self._mean((view.camera_loss - view.loss)[:, None]))
+        if self.config.rival:
+            assert batch.rival is not None
+            assert view.rival_losses is not None
+            assert view.loss is not None
+            beside += [self.grid.pick(batch.rival) - picked, self._mean(view.rival_losses - view.loss[:, None])]
         return camera, residual, beside + [self._within(state[:, channel : channel + 1]) for channel in (0, 3)]
 
     def _input(self, name: Input, view: View, picked: Tensor, batch: Batch) -> Tensor:

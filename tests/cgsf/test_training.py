@@ -23,7 +23,7 @@ from cgsf.sample_cache import SampleCache, write_cache
 from cgsf.stages import STAGES
 from cgsf.start_cache import StartCache, write_starts
 from cgsf.starts import StartConfig, load_start_config
-from cgsf.training import export_best, train
+from cgsf.training import Batches, export_best, train
 from learned.augment import AugmentConfig
 from learned.checkpoint import ModelCard, load, save
 from learned.pwcnet import PWCNet, PWCNetConfig
@@ -111,6 +111,33 @@ def test_every_stage_trains_and_exports(folder, tmp_path, stage):
     assert record["seed"] == 0
     export_best(settings, tmp_path / "run", tmp_path / "net.safetensors")
     assert "2 steps" in (tmp_path / "net.safetensors.md").read_text()
+
+
+def test_a_refiner_weighs_the_networks_state(folder, tmp_path):
+    """From two caches of states to a pipeline that runs the networks beside the solver."""
+    disparity, motion = weights(tmp_path)
+    networks = load_start_config("feedforward", disparity=disparity, motion=motion)
+    write_starts(tmp_path / "rivals", SampleCache(folder / "cache"), networks)
+    settings = recipe(folder, "refiner", rivals=str(tmp_path / "rivals"), refiner=dataclasses.replace(SMALL_REFINER, rival=True))
+    batches = Batches(settings, SampleCache(folder / "cache"), StartCache(settings.starts), StartCache(settings.rivals))
+    np.testing.assert_array_equal(batches.sample(2).rival[0], StartCache(settings.rivals)[2]["start"])
+    train(settings, tmp_path / "run")
+    trained = STAGES["refiner"].network(settings)
+    with torch.no_grad():
+        trained.gates.bias[-4:] = 20.0  # motion from the rival, wide open
+    save(trained, tmp_path / "r.safetensors", ModelCard("a test"))
+    preset = tmp_path / "preset.toml"
+    tables = {"feedforward": {"disparity": disparity, "motion": motion}, "refined": {"refiner": f"{tmp_path}/r.safetensors"}}
+    preset.write_text(toml(tables))
+    images = scenes.plane(np.random.default_rng(0), 70, 100)
+    refined = cgsf.estimate(*images, method="variational+refiner", preset=str(preset))
+    rival = cgsf.estimate(*images, method="feedforward", preset=str(preset))
+    np.testing.assert_allclose(refined.flow, rival.flow, atol=1e-3)
+    assert np.abs(refined.initial.flow - rival.flow).max() > 1
+    write_cache(tmp_path / "others", ["other"], make, SIZE)
+    write_starts(tmp_path / "wrong", SampleCache(tmp_path / "others"), StartConfig("opencv"))
+    with pytest.raises(InputError, match="other samples"):
+        train(dataclasses.replace(settings, rivals=str(tmp_path / "wrong")), tmp_path / "other")
 
 
 def toml(table: dict, name: str = "") -> str:
@@ -309,9 +336,6 @@ def test_shipped_recipes_fit_the_shipped_networks():
 
 def test_steps_before_lead_to_other_starts(folder):
     """The refiner learns from what it has made of a start, not from the start alone."""
-    from cgsf.stages import STAGES
-    from cgsf.training import Batches
-
     settings = recipe(folder, "refiner", steps_before=3)
     batch = Batches(settings, SampleCache(folder / "cache"), StartCache(folder / "starts"))(0)
     model = STAGES["refiner"].network(settings)
@@ -326,8 +350,6 @@ def test_steps_before_lead_to_other_starts(folder):
 
 
 def test_one_shuffled_pass_sees_every_sample_once(folder):
-    from cgsf.training import Batches
-
     settings = recipe(folder, "flow", held_out=1, batch=1)
     batches = Batches(settings, SampleCache(folder / "cache"))
     first, second = ([batches(i).names[0] for i in range(start, start + 3)] for start in (0, 3))

@@ -61,6 +61,14 @@ def test_mirroring_turns_vertical_motion(batch: Batch):
     assert torch.equal(mirrored[0].backward_flow[0, 1], -batch.backward_flow[0, 1].flip(-2))
 
 
+def test_a_rival_is_changed_as_the_start_is(batch: Batch):
+    start = torch.randn(batch.truth.shape, generator=generator(7))
+    config = dataclasses.replace(PLAIN, zoom=0.4, stretch=0.2, flip=True)
+    for seed in range(4):
+        changed = augment(dataclasses.replace(batch, start=start, rival=start), config, generator(seed))
+        assert torch.equal(changed.rival, changed.start)
+
+
 def test_colour_changes_all_images_alike_but_for_a_part(batch: Batch):
     config = dataclasses.replace(PLAIN, colour=0.3, unequal=0.0)
     images = augment(batch, config, generator()).images[0]

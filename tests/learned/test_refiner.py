@@ -5,13 +5,14 @@ import dataclasses
 import pytest
 import torch
 
-from learned.alternatives import Grid, Neighbours, camera_motion, gated_change, reliability_loss, second_pair
+from learned.alternatives import Grid, Neighbours, adopted_change, camera_motion, gated_change, reliability_loss, second_pair
 from learned.batch import Batch
 from learned.hybrid import Hybrid, refine
 from learned.oracle import Oracle
 from learned.refiner import COMPACT, Refiner, RefinerConfig, View
 
 SMALL = dataclasses.replace(COMPACT, layers=((8, 1), (8, 2)), neighbours=(1, 3), steps=3)
+SMALL_RIVAL = dataclasses.replace(SMALL, rival=True)
 HEIGHT, WIDTH = 37, 51
 
 
@@ -38,8 +39,9 @@ def test_published_sizes():
     assert shapes == [(512, 11, 3, 3), (512, 512, 3, 3), (5, 512, 3, 3)]
 
 
-@pytest.mark.parametrize("config", [RefinerConfig(layers=((8, 1), (8, 1)), steps=2), SMALL])
+@pytest.mark.parametrize("config", [RefinerConfig(layers=((8, 1), (8, 1)), steps=2), SMALL, SMALL_RIVAL])
 def test_untrained_changes_nothing(batch: Batch, config: RefinerConfig):
+    batch = dataclasses.replace(batch, rival=batch.start + 1)
     states = refine(Refiner(config), batch).states
     assert len(states) == config.steps + 1
     for state in states:
@@ -182,6 +184,45 @@ def test_the_gates_kernel_does_what_is_written_plainly(divisor: int, size: tuple
         assert torch.allclose(gated_change(state, values, gates, Grid(divisor)), plain, atol=1e-4)
 
 
+def test_a_rivals_values_come_in_pixel_by_pixel():
+    """Disparities through one gate, motion through the other; in whole they replace state and change."""
+    generator = torch.Generator().manual_seed(4)
+    change, state, rival = torch.randn(3, 1, 5, 5, 7, generator=generator)
+    for group, channels in enumerate(([0, 1], [2, 3, 4])):
+        gates = torch.zeros(1, 8, 3, 4)
+        gates[:, 4 * group + 1] = 1  # the upper right pixel of each block
+        result = state + adopted_change(change, state, rival, gates, Grid(2))
+        expected = state + change
+        for channel in channels:
+            expected[0, channel, ::2, 1::2] = rival[0, channel, ::2, 1::2]
+        assert torch.allclose(result, expected, atol=1e-6)
+
+
+def test_a_rival_is_weighed_by_its_energies(batch: Batch):
+    """Its disparities and its motion apart; without it the refiner says what is missing."""
+    refiner = shaken(Refiner(SMALL_RIVAL))
+    generator = torch.Generator().manual_seed(8)
+    rival = batch.start + torch.randn(batch.start.shape, generator=generator)
+    batch = dataclasses.replace(batch, rival=rival)
+    oracle = Oracle(*batch.frames, batch.backward_flow)
+    seen = []
+
+    class Watching:
+        def features(self, state: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+            seen.append(state)
+            return oracle.features(state)
+
+    first = refine(refiner, batch, Watching(), 1).states[1]
+    disparities, motion = (torch.cat([a[:, :2], b[:, 2:]], 1) for a, b in ((rival, batch.start), (batch.start, rival)))
+    assert any(torch.equal(state, disparities) for state in seen)
+    assert any(torch.equal(state, motion) for state in seen)
+    with torch.no_grad():  # the inputs that tell of the rival, silenced
+        refiner.hidden[0].weight[:, SMALL.channels - 6 :] = 0
+    assert not torch.allclose(refine(refiner, batch, oracle, 1).states[1], first)
+    with pytest.raises(ValueError, match="rival"):
+        refine(refiner, dataclasses.replace(batch, rival=None))
+
+
 def test_the_cameras_energy_is_looked_at(batch: Batch):
     """A camera that explains the motion is told apart from one that does not."""
     refiner = shaken(Refiner(SMALL))
@@ -229,7 +270,8 @@ def test_hybrid_is_networks_then_refiner(batch: Batch):
 
 
 @pytest.mark.parametrize("wrong", [{"inputs": ()}, {"inputs": ("state", "colour")}, {"inputs": ("state", "state")},
-                                   {"evidence": 2}, {"divisor": 0}, {"layers": ()}, {"neighbours": (0,)}])  # fmt: skip
+                                   {"evidence": 2}, {"divisor": 0}, {"layers": ()}, {"neighbours": (0,)},
+                                   {"rival": True}])  # fmt: skip
 def test_impossible_configurations_are_refused(wrong: dict):
     with pytest.raises(ValueError, match="must"):
         RefinerConfig(**wrong)
