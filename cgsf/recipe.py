@@ -50,6 +50,10 @@ class Recipe:
     """Joint: the motion network to begin with, a name or a file."""
     held_out: int = 16
     """The cache's first samples are for validation only."""
+    further: tuple[str, ...] = ()
+    """Flow, disparity: folders of further samples to train with, such as real ones with what a method says for truth."""
+    further_share: float = 0.2
+    """How often a sample is one of those."""
     batch: int = 4
     """Samples a step and process."""
     pwcnet: PWCNetConfig = field(default_factory=PWCNetConfig)

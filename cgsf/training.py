@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import os
 import pickle
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -77,7 +77,9 @@ def train(recipe: Recipe, folder: str | Path, seconds: float = float("inf"), pro
     rivals = _starts(recipe.rivals, cache) if recipe.stage == "refiner" and recipe.refiner.rival else None
     if recipe.starts and recipe.stage == "joint" and not starts:
         raise InputError('starts take the place of networks that are frozen, as training.frozen = ["feedforward"]')
-    batches = Batches(recipe, cache, starts, rivals)
+    if recipe.further and starts:
+        raise InputError("further samples have no starts: they are for the stages flow and disparity")
+    batches = Batches(recipe, cache, starts, rivals, [SampleCache(folder) for folder in recipe.further])
     if batches.count < 1:
         raise InputError(f"{recipe.cache}: all of its samples are held out ({recipe.held_out}): none to train with")
     check_truth(recipe, cache)
@@ -97,30 +99,36 @@ class Batches:
     """``batch_at`` over a cache: every pass shuffles anew, every draw depends on the index alone."""
 
     def __init__(
-        self, recipe: Recipe, cache: SampleCache, starts: StartCache | None = None, rivals: StartCache | None = None
-    ) -> None:
+        self, recipe: Recipe, cache: SampleCache, starts: StartCache | None = None, rivals: StartCache | None = None,
+        further: Sequence[SampleCache] = (),
+    ) -> None:  # fmt: skip
         self.recipe, self.cache, self.starts, self.rivals = recipe, cache, starts, rivals
+        self.further = [(more, index) for more in further for index in range(len(more))]
         self.count = min(len(source) for source in (cache, starts, rivals) if source is not None) - recipe.held_out
 
     def __call__(self, index: int) -> Batch:
         recipe, seed = self.recipe, self.recipe.training.seed
         chosen = []
         for position in range(index * recipe.batch, (index + 1) * recipe.batch):
-            order = np.random.default_rng([seed, position // self.count]).permutation(self.count)
-            chosen.append(recipe.held_out + int(order[position % self.count]))
+            draw = np.random.default_rng([seed, position, len(self.further)])
+            if self.further and draw.random() < recipe.further_share:
+                chosen.append(_images_and_truth(*self.further[draw.integers(len(self.further))]))
+            else:
+                order = np.random.default_rng([seed, position // self.count]).permutation(self.count)
+                chosen.append(self.sample(recipe.held_out + int(order[position % self.count])))
         generator = torch.Generator().manual_seed(seed * 1_000_003 + index)
-        return Batch.cat([augment(self.sample(i), recipe.augment, generator) for i in chosen])
+        return Batch.cat([augment(sample, recipe.augment, generator) for sample in chosen])
 
     def sample(self, index: int) -> Batch:
         """One sample of the cache as a batch; its images are bytes."""
-        images, truth = (torch.from_numpy(np.array(array)[None]) for array in self.cache[index])
-        images, names = images.permute(0, 1, 4, 2, 3), (self.cache.names[index],)
+        plain = _images_and_truth(self.cache, index)
         if self.starts is None:
-            return Batch(images, truth, names=names)
+            return plain
         known = {name: torch.from_numpy(np.array(array)[None]) for name, array in self.starts[index].items()}
         rival = None if self.rivals is None else torch.from_numpy(np.array(self.rivals[index]["start"])[None])
-        return Batch(
-            images, truth, known["start"], known["backward"], known["evidence"], rival, known["homography"], names
+        return replace(
+            plain, start=known["start"], backward_flow=known["backward"], evidence=known["evidence"], rival=rival,
+            homography=known["homography"],
         )  # fmt: skip
 
     def held_out(self) -> Iterator[Batch]:
@@ -128,6 +136,11 @@ class Batches:
         for index in range(self.recipe.held_out):
             sample = self.sample(index)
             yield replace(sample, images=sample.images.float() / 255)
+
+
+def _images_and_truth(cache: SampleCache, index: int) -> Batch:
+    images, truth = (torch.from_numpy(np.array(array)[None]) for array in cache[index])
+    return Batch(images.permute(0, 1, 4, 2, 3), truth, names=(cache.names[index],))
 
 
 def _starts(folder: str, cache: SampleCache) -> StartCache:

@@ -21,6 +21,11 @@ def command() -> None:
 @click.option("--dataset", metavar="NAME", help="Or read a data set of this name ...")
 @click.option("--root", metavar="FOLDER", help="... in this folder; it needs no truth.")
 @dataset_options
+@click.option("--truth", metavar="METHOD", help="Of a data set: take what this method says, where it is surest, for the truth.")
+@click.option(
+    "--keep", type=click.FloatRange(0, 1, min_open=True), default=0.7, show_default=True, help="Share of the surest pixels."
+)
+@click.option("--reverse", is_flag=True, help="With --truth: every sample with its two times exchanged, too.")
 @click.option("--count", type=click.IntRange(1), help="Number of samples; all of a data set, 1000 rendered ones.")
 @click.option("--size", default="320x640", show_default=True, metavar="HxW", help="Height and width in pixels.")
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of the first rendered sample.")
@@ -28,18 +33,21 @@ def command() -> None:
 @workers_option
 def samples(
     output: str, families: tuple[str, ...], dataset: str | None, root: str | None, options: tuple[str, ...],
-    count: int | None, size: str, seed: int, photos: Path | None, workers: int,
+    truth: str | None, keep: float, reverse: bool, count: int | None, size: str, seed: int, photos: Path | None, workers: int,
 ) -> None:  # fmt: skip
     """Cache samples: rendered ones (--family), or those of a data set (--dataset and --root).
 
     A data set's larger images are cut to the size around their centre.
     """
-    from cgsf.datasets import open_dataset
+    from cgsf.datasets import Dataset, open_dataset
+    from cgsf.pseudo_truth import PseudoTruth
     from cgsf.sample_cache import write_cache
     from cgsf.synthetic import export
 
     if bool(families) == bool(dataset) or bool(dataset) != bool(root):
         raise InputError("give either --family (once or more), or --dataset and --root")
+    if (families and truth) or (reverse and not truth):
+        raise InputError("--truth is for a data set, and --reverse for --truth")
     height, width = _size(size)
     if families:
         count = count or 1000
@@ -47,7 +55,9 @@ def samples(
         with count_bar(count) as progress:
             export.write_cache(output, families, count, seed, height, width, progress, workers, **more)
     else:
-        source = open_dataset(str(dataset), str(root), **parse_options(options))
+        source: Dataset = open_dataset(str(dataset), str(root), **parse_options(options))
+        if truth:
+            source = PseudoTruth(source, truth, keep, reverse)
         count = min(count or len(source), len(source))
         with count_bar(count) as progress:
             write_cache(output, source.names[:count], source.__getitem__, (height, width), progress, workers)

@@ -9,6 +9,7 @@ import pytest
 import torch
 from click.testing import CliRunner, Result
 
+import cgsf
 from cgsf.camera_motion import find_homography
 from cgsf.cli import main
 from cgsf.intake import to_frames
@@ -74,6 +75,24 @@ def test_samples_of_a_data_set_without_truth(tmp_path: Path, frames: Path):
     assert np.isnan(truth).all()
 
 
+def test_what_a_method_is_surest_of_stands_for_the_truth(tmp_path: Path, frames: Path):
+    """The solver's maps, where it is surest, of both orders of time; unknown elsewhere."""
+    made = call("samples", "-o", tmp_path / "c", "--dataset", "frames", "--root", frames, "--size", "70x100",
+                "--truth", "variational", "--keep", 0.5, "--reverse", "--count", 2)  # fmt: skip
+    assert made.exit_code == 0, made.output
+    cache = SampleCache(tmp_path / "c")
+    assert cache.names == ["scene/scene_0", "scene/scene_0-reversed"]
+    (images, truth), (swapped, back) = cache[0], cache[1]
+    np.testing.assert_array_equal(swapped[[2, 3, 0, 1]], images)
+    solved = cgsf.estimate(*images)
+    known = np.isfinite(truth)
+    assert 0.5 <= known.mean() < 0.6
+    assert solved.confidence[known[0]].min() >= solved.confidence[~known[0]].max()
+    np.testing.assert_allclose(truth[known], solved.state()[known], atol=1e-5)
+    assert np.abs(np.nanmedian(back[3:], (1, 2)) + scenes.FLOW).max() < 0.5
+    assert np.abs(np.nanmedian(back[:3], (1, 2)) - (10, 8, -2)).max() < 0.5
+
+
 def test_starts_of_the_networks_go_on(tmp_path: Path, frames: Path, monkeypatch: pytest.MonkeyPatch):
     call("samples", "-o", tmp_path / "c", "--dataset", "frames", "--root", frames, "--size", "64x96")
     disparity, motion = weights(tmp_path)
@@ -131,6 +150,9 @@ def test_refusals_are_one_line(tmp_path: Path, frames: Path, monkeypatch: pytest
         "other samples": (*made, "--seed", 1),
         "another size": (*made[:-1], 2),
         "give either": made[:3],
+        "--truth is for a data set": (*made, "--truth", "variational"),
+        "how sure it is": ("samples", "-o", tmp_path / "g", "--dataset", "frames", "--root", frames, "--size", "64x96",
+                           "--truth", "opencv"),
         "as 320x640": ("samples", "-o", tmp_path / "d", "--family", "things", "--size", "32"),
         "unknown family": ("samples", "-o", tmp_path / "d", "--family", "clouds"),
         "cannot be continued": ("samples", "-o", tmp_path / "torn", "--family", "things", "--size", "32x48"),

@@ -197,6 +197,21 @@ def test_two_processes_train_jointly(folder, tmp_path):
     assert np.isfinite(lines[-1]["score"])
 
 
+def test_further_samples_are_drawn_now_and_then(folder, tmp_path):
+    """At their share, of another size, never for validation; the order of the others stays."""
+    further = write_cache(tmp_path / "more", ["more-0", "more-1"], make, (60, 80))
+    plain = recipe(folder, "flow", starts="", further=(str(further.folder),), further_share=0.5)
+    batches = Batches(plain, SampleCache(folder / "cache"), further=[further])
+    names = [name for index in range(60) for name in batches(index).names]
+    drawn = [name for name in names if name.startswith("more")]
+    assert 40 < len(drawn) < 80
+    assert set(drawn) == set(further.names)
+    alone = [name for index in range(60) for name in Batches(plain, SampleCache(folder / "cache"))(index).names]
+    assert all(a == b for a, b in zip(alone, names, strict=True) if not b.startswith("more"))
+    assert batches(7).names == batches(7).names
+    assert np.isfinite(train(plain, tmp_path / "run")["score"])
+
+
 def test_supervision_without_truth(folder, tmp_path):
     first = train(recipe(folder, "refiner", supervision="energy"), tmp_path / "energy")
     second = train(recipe(folder, "refiner", supervision="both"), tmp_path / "both")
@@ -313,6 +328,7 @@ def test_bad_input_is_one_clear_line(folder, tmp_path):
         "is no cache of starts": lambda: train(recipe(folder, "refiner", starts=str(tmp_path)), tmp_path / "other"),
         "held out": lambda: train(recipe(folder, "flow", held_out=4), tmp_path / "third"),
         "that are frozen": lambda: train(joint(folder, starts=str(folder / "starts")), tmp_path / "fourth"),
+        "have no starts": lambda: train(recipe(folder, "refiner", further=(str(folder / "cache"),)), tmp_path / "fifth"),
         "for ablations": lambda: export_best(recipe(folder, "refiner", energy=EnergyConfig(0)), energy_run, "x.safetensors"),
         "not of a refiner": lambda: pipelines.solve(make(0).images, "variational+refiner", config),
         "no weights": lambda: export_best(recipe(folder, "flow"), tmp_path, tmp_path / "x.safetensors"),
