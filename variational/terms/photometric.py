@@ -30,10 +30,8 @@ C1, C2 = 0.01**2, 0.03**2
 
 def padded_planes(image: np.ndarray, dtype: np.dtype | type) -> np.ndarray:
     """``(H, W, c)`` image as the kernels want it: ``(c, H + 2, W + 2)``, contiguous, reflected by one pixel."""
-    rows, columns = (np.abs(np.arange(-1, size + 1)) for size in image.shape[:2])
-    rows[-1], columns[-1] = max(image.shape[0] - 2, 0), max(image.shape[1] - 2, 0)
-    rows, columns = np.minimum(rows, image.shape[0] - 1), np.minimum(columns, image.shape[1] - 1)
-    return np.ascontiguousarray(image.transpose(2, 0, 1).astype(dtype)[:, rows[:, None], columns])
+    planes = image.transpose(2, 0, 1).astype(dtype, copy=False)
+    return np.ascontiguousarray(np.pad(planes, ((0, 0), (1, 1), (1, 1)), mode="reflect"))
 
 
 @scalar
