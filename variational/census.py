@@ -11,7 +11,7 @@ import numpy as np
 from numba import types
 from numba.extending import intrinsic
 
-from variational.jit import over_rows, rowwise
+from variational.jit import inlined, over_rows, rowwise
 
 CENSUS_ROWS, CENSUS_COLUMNS = 3, 4
 """Half window of the census: 7 rows x 9 columns, 62 comparisons in one 64-bit word."""
@@ -79,20 +79,22 @@ def census(grey: np.ndarray) -> np.ndarray:
     return words
 
 
-@rowwise
-def write_matching_costs(left: np.ndarray, right_mirrored: np.ndarray, x: int, costs: np.ndarray) -> None:
-    """Costs (D,) of the disparities of pixel x of a row, in differing bits; OUTSIDE_COST where the match lies outside.
+@inlined
+def write_matching_costs(left: np.ndarray, right_mirrored: np.ndarray, y: int, x: int, costs: np.ndarray) -> None:
+    """Costs of the disparities of pixel (x, y), in differing bits; OUTSIDE_COST where the match lies outside.
 
-    left, right_mirrored (2, W): the row's words, the right image's from its right end, so that disparities follow in
-    the order of memory.
+    left, right_mirrored (2, H, W): words, the right image's from its right end, so that disparities follow in the order of
+    memory. costs (H, W, D).
     """
-    reach = min(x + 1, costs.size)
-    fine, wide = left[0, x], left[1, x]
-    begin = left.shape[1] - 1 - x
-    right_fine, right_wide = right_mirrored[0, begin : begin + reach], right_mirrored[1, begin : begin + reach]
+    disparities = costs.shape[2]
+    reach = min(x + 1, disparities)
+    fine, wide = left[0, y, x], left[1, y, x]
+    begin = left.shape[2] - 1 - x
     for d in range(reach):
-        costs[d] = popcount(fine ^ right_fine[d]) + popcount(wide ^ right_wide[d])
-    costs[reach:] = OUTSIDE_COST
+        at = np.uintp(begin + d)  # an index that may be negative, as numba sees it, is gathered word by word
+        costs[y, x, d] = popcount(fine ^ right_mirrored[0, y, at]) + popcount(wide ^ right_mirrored[1, y, at])
+    for d in range(reach, disparities):
+        costs[y, x, d] = OUTSIDE_COST
 
 
 @rowwise
@@ -100,7 +102,7 @@ def _matching_costs(first: int, last: int, left: np.ndarray, right_mirrored: np.
     width = costs.shape[1]
     for y in range(first, last):
         for x in range(width):
-            write_matching_costs(left[:, y], right_mirrored[:, y], x, costs[y, x])
+            write_matching_costs(left, right_mirrored, y, x, costs)
 
 
 def stereo_costs(words_left: np.ndarray, words_right: np.ndarray, disparities: int) -> np.ndarray:

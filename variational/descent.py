@@ -23,7 +23,7 @@ from variational.pyramid import frames_pyramid, pyramid_shapes
 from variational.search import match_around
 from variational.state import D1, D2, C, flow_of, resize_maps, resize_state
 from variational.terms.constancy import Constancy, ConstancyConfig
-from variational.visibility import backward_flow, project_visibility
+from variational.visibility import backward_flow, project_visibility, seen_in_right
 
 History = list[dict]
 
@@ -100,13 +100,6 @@ def edge_factors(grey: np.ndarray, sharpness: float = 10.0, least: float = 0.05)
     factors[0, :, 1:] = least + (1 - least) * np.exp(-sharpness * np.abs(np.diff(grey, axis=1)))
     factors[1, 1:] = least + (1 - least) * np.exp(-sharpness * np.abs(np.diff(grey, axis=0)))
     return factors
-
-
-def seen_in_right(disparity: np.ndarray) -> np.ndarray:
-    """(H, W) bool: pixels of a left image that nothing nearer hides from the right camera."""
-    as_motion = np.zeros((5, *disparity.shape), np.float32)
-    as_motion[D1], as_motion[3] = disparity, -disparity
-    return project_visibility(as_motion, margin_px=1.0)
 
 
 def _seen(state: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

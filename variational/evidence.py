@@ -137,7 +137,7 @@ def _write_costs(
                 for d in range(max(int(known) - reach, 0), min(int(known) + reach + 1, disparities)):
                     row[d] = np.uint8(min(abs(np.float32(d) - known) * anchor, most))
                 continue
-            write_matching_costs(words_left1[:, y], right1_mirrored[:, y], x, row)
+            write_matching_costs(words_left1, right1_mirrored, y, x, costs)
             h, fx = homographies[max(labels[y, x], 0)], np.float32(x)
             start = (
                 h[0, 0] * fx + h[0, 1] * fy + h[0, 3], h[1, 0] * fx + h[1, 1] * fy + h[1, 3],

@@ -78,6 +78,34 @@ def find_landmarks(grey: np.ndarray, config: ObjectsConfig, mask: np.ndarray | N
     return Landmarks(places, np.empty((0, 128), np.float32) if words is None else words)
 
 
+def match_words(words1: np.ndarray, words2: np.ndarray, ratio: float) -> tuple[np.ndarray, np.ndarray]:
+    """Descriptions of one image that are much closer to one of another's than to all else of it.
+
+    All pairs at once, by one product of matrices. Descriptions are whole numbers up to 255, so their products are exact in
+    float32, in whatever order they are summed.
+
+    Parameters
+    ----------
+    words1, words2 : np.ndarray
+        (N, 128), (M, 128) float32, M >= 2.
+    ratio : float
+        Least distance of the second best, as a share of which the best's must be less.
+
+    Returns
+    -------
+    places, partners : np.ndarray
+        (n,) indices into the first image's, and into the second's.
+    """
+    squares1, squares2 = (np.einsum("ij,ij->i", words, words) for words in (words1, words2))
+    distances = squares2 - 2 * (words1 @ words2.T)
+    partners, rows = distances.argmin(axis=1), np.arange(len(words1))
+    best = distances[rows, partners]
+    distances[rows, partners] = np.inf
+    second = distances.min(axis=1)
+    places = np.flatnonzero(best + squares1 < ratio**2 * (second + squares1))
+    return places, partners[places]
+
+
 def find_objects(
     start: Start, disparity: np.ndarray, left1: np.ndarray, landmarks2: Landmarks, surfaces: list[np.ndarray],
     projection: np.ndarray, config: ObjectsConfig,
@@ -110,11 +138,10 @@ def find_objects(
     landmarks1 = find_landmarks(left1, config, around)
     if len(landmarks1.places) < config.least_matches:
         return []
-    pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(landmarks1.words, landmarks2.words, k=2)
-    good = [m for m, second in pairs if m.distance < config.ratio * second.distance]
+    good, partners = match_words(landmarks1.words, landmarks2.words, config.ratio)
     if len(good) < config.least_matches:
         return []
-    at1, at2 = landmarks1.places[[m.queryIdx for m in good]], landmarks2.places[[m.trainIdx for m in good]]
+    at1, at2 = landmarks1.places[good], landmarks2.places[partners]
     x1, y1, x2, y2 = np.rint(np.hstack([at1, at2])).astype(np.intp).T
     first = np.column_stack([at1, disparity[y1, x1]])
     second = np.column_stack([at2, start.match2.disparity[y2, x2]])

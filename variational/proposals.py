@@ -166,10 +166,17 @@ def propose(
     labels, cost = fuse(1)
     if not evidence.fill:
         return Proposal(state, labels, motions, cost)
-    surfaces = unexplained_surfaces(state[D1], cost, project_visibility(state), objects)
-    motions += find_objects(start, state[D1], grey, landmarks2, surfaces, known.projection(), objects)
+
+    def lost_objects() -> list[RigidMotion]:
+        surfaces = unexplained_surfaces(state[D1], cost, project_visibility(state), objects)
+        return find_objects(start, state[D1], grey, landmarks2, surfaces, known.projection(), objects)
+
     homographies = np.stack([motion.homography for motion in motions])
-    state[D1] = refill(start.match1, start.match2, grey, labels, homographies, matching, evidence)
+    disparity, found = side_by_side(
+        lambda: refill(start.match1, start.match2, grey, labels, homographies, matching, evidence), lost_objects
+    )
+    state[D1] = disparity
+    motions += found
     labels, cost = fuse(2)
     return Proposal(state, labels, motions, cost)
 

@@ -83,6 +83,31 @@ def project_visibility(state: np.ndarray, margin_px: float = 1.5) -> np.ndarray:
 
 
 @rowwise
+def _seen_in_right(first: int, last: int, disparity: np.ndarray, margin: float, seen: np.ndarray) -> None:
+    width = disparity.shape[1]
+    front = np.empty(width + 1, np.float32)  # largest disparity landing on each pixel of right1's row
+    for y in range(first, last):
+        for x in range(width + 1):
+            front[x] = -1
+        for x in range(width):
+            to_x = int(np.floor(x - disparity[y, x]))
+            if 0 <= to_x < width:
+                front[to_x] = max(front[to_x], disparity[y, x])
+            if -1 <= to_x < width:
+                front[to_x + 1] = max(front[to_x + 1], disparity[y, x])
+        for x in range(width):
+            to_x = int(np.rint(x - disparity[y, x]))
+            seen[y, x] = 0 <= to_x < width and disparity[y, x] >= front[to_x] - margin
+
+
+def seen_in_right(disparity: np.ndarray, margin_px: float = 1.0) -> np.ndarray:
+    """(H, W) bool: pixels of a left image that nothing nearer, by more than `margin_px`, hides from the right camera."""
+    seen = np.empty(disparity.shape, bool)
+    over_rows(_seen_in_right, len(seen), disparity, np.float32(margin_px), seen)
+    return seen
+
+
+@rowwise
 def _backward(
     first: int, last: int, disparity: np.ndarray, u: np.ndarray, v: np.ndarray, up: float, down: float,
     front: np.ndarray, margin: float, best: np.ndarray, backward: np.ndarray,

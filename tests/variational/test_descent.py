@@ -5,7 +5,7 @@ import pytest
 from scipy.sparse.linalg import cg
 
 from tests.variational.scenes import two_layers
-from variational.descent import DescentConfig, FromZeroConfig, RefineConfig, descend_energy, from_zero, refine, seen_in_right
+from variational.descent import DescentConfig, FromZeroConfig, RefineConfig, descend_energy, from_zero, refine
 from variational.energy import EnergyConfig
 from variational.matching import MatchingConfig
 from variational.minimise import GROUPS, DescendConfig, RelaxConfig, descend, relax
@@ -177,10 +177,3 @@ def test_descent_of_the_energy_lowers_it_on_every_level():
     for level in (0, 1):
         energies = [h["energy"] for h in history if h["level"] == level]
         assert min(energies) < energies[0]
-
-
-def test_what_the_right_camera_cannot_see():
-    disparity = np.full((4, 20), 2, np.float32)
-    disparity[:, 10:15] = 6  # hides the four background pixels to its left
-    seen = seen_in_right(disparity)
-    np.testing.assert_array_equal(np.flatnonzero(~seen[1]), [0, 1, 6, 7, 8, 9])

@@ -2,6 +2,7 @@
 
 import logging
 
+import cv2
 import numba
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from variational.confidence import confidence
 from variational.descent import DescentConfig
 from variational.frames import Frames
 from variational.minimise import DescendConfig
-from variational.objects import ObjectsConfig, unexplained_surfaces
+from variational.objects import ObjectsConfig, find_landmarks, match_words, unexplained_surfaces
 from variational.solver import SolverConfig, solve
 
 CAMERA = StereoCamera(80.0, 80.0, 53.5, 35.5, 0.5)
@@ -121,6 +122,19 @@ def test_confidence_doubts_what_was_not_seen():
     state[0, :, 8:] = 30
     beside = confidence(state, cost, sure, sure, sure)
     assert beside[6, 8] < beside[6, 2]
+
+
+def test_words_match_as_by_brute_force():
+    grey = cv2.GaussianBlur(np.random.default_rng(4).random((200, 240), dtype=np.float32), (0, 0), 2)
+    grey = (grey - grey.min()) / (grey.max() - grey.min())
+    words1, words2 = (find_landmarks(image, ObjectsConfig()).words for image in (grey, np.roll(grey, 7, axis=1)))
+    assert len(words1) > 50
+    assert (words1 == np.rint(words1)).all()  # what makes the product exact
+    places, partners = match_words(words1, words2, 0.85)
+    pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(words1, words2, k=2)
+    expected = [(m.queryIdx, m.trainIdx) for m, second in pairs if m.distance < 0.85 * second.distance]
+    assert 10 < len(expected) < len(words1)
+    assert list(zip(places, partners, strict=True)) == expected
 
 
 def test_surfaces_end_where_the_disparity_jumps():

@@ -5,6 +5,7 @@ import pytest
 
 from tests import naive
 from variational.terms.visibility import visible_mask, visible_stereo
+from variational.visibility import seen_in_right
 
 
 def test_mask_equals_naive():
@@ -45,3 +46,24 @@ def test_stereo_of_two_planes():
 def test_stereo_without_a_number_is_hidden():
     left = np.full((3, 8), np.nan)
     assert not visible_stereo(left, np.zeros((3, 8))).any()
+
+
+def test_what_the_right_camera_cannot_see():
+    disparity = np.full((4, 20), 2, np.float32)
+    disparity[:, 10:15] = 6  # hides the four background pixels to its left
+    seen = seen_in_right(disparity)
+    for row in seen:
+        np.testing.assert_array_equal(np.flatnonzero(~row), [0, 1, 6, 7, 8, 9])
+
+
+def test_seen_in_right_equals_its_plain_twin():
+    disparity = np.random.default_rng(3).uniform(-1, 9, (5, 33)).astype(np.float32)
+    margin = 1.0
+    expected = np.zeros(disparity.shape, bool)
+    for y, row in enumerate(disparity):
+        for x, d in enumerate(row):
+            to_x = round(float(x - d))
+            hiding = [e for i, e in enumerate(row) if to_x in (np.floor(i - e), np.floor(i - e) + 1)]
+            expected[y, x] = 0 <= to_x < len(row) and d >= max(hiding, default=-1) - margin
+    assert 0.2 < expected.mean() < 0.9
+    np.testing.assert_array_equal(seen_in_right(disparity, margin), expected)
