@@ -15,6 +15,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from learned.gate_kernels import gated_change as gate_kernel
+from learned.threads import over_tasks
 
 # Channels of the state on left1's grid that are trusted, or not, together: D1; C, u and v. D2 lives on left2's grid.
 _GROUPS = ((0,), (2, 3, 4))
@@ -178,7 +179,7 @@ def gated_change(state: Tensor, values: Tensor, gates: Tensor, grid: Grid) -> Te
     if state.device.type == "cpu" and state.dtype == torch.float32 and not torch.is_grad_enabled():
         change = torch.empty(state.shape)
         arrays = (maps.contiguous().numpy() for maps in (state, values, gates))
-        gate_kernel(*arrays, grid.divisor, change.numpy())
+        over_tasks(gate_kernel, state.shape[0] * state.shape[2], *arrays, grid.divisor, change.numpy())
         return change
     size = state.shape[-2], state.shape[-1]
     mixture, camera, residual, correction = grid.spread(values, size).split((4, 3, 1, 5), 1)

@@ -14,7 +14,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from learned.jit import lanes, parallel, prange
+from learned.jit import lanes, tasks
+from learned.threads import over_tasks
 
 
 def correlation(first: Tensor, second: Tensor, radius: int = 4) -> Tensor:
@@ -90,7 +91,7 @@ class _Correlation(torch.autograd.Function):
         ctx.radius = radius
         size = 2 * radius + 1
         out = torch.empty((first.shape[0], size * size, *first.shape[2:]))
-        _forward(_array(first), _padded(second, radius), out.numpy())
+        over_tasks(_forward, _rows(out), _array(first), _padded(second, radius), out.numpy())
         return out
 
     @staticmethod
@@ -100,18 +101,23 @@ class _Correlation(torch.autograd.Function):
         to_first = to_second = None
         if ctx.needs_input_grad[0]:
             to_first = torch.zeros(first.shape)
-            _backward(_array(gradient), _padded(second, radius), to_first.numpy())
+            over_tasks(_backward, _rows(first), _array(gradient), _padded(second, radius), to_first.numpy())
         if ctx.needs_input_grad[1]:
             # b is to a at the displacement -d: the same kernel with the volume mirrored, seen from b's pixels
             to_second = torch.zeros(second.shape)
             mirrored = np.empty(gradient.shape, np.float32)
-            _mirror(_array(gradient), radius, mirrored)
-            _backward(mirrored, _padded(first, radius), to_second.numpy())
+            over_tasks(_mirror, gradient.shape[0] * gradient.shape[1], _array(gradient), radius, mirrored)
+            over_tasks(_backward, _rows(first), mirrored, _padded(first, radius), to_second.numpy())
         return to_first, to_second, None
 
 
 def _at_least_float32(tensor: Tensor) -> Tensor:
     return tensor.to(torch.promote_types(tensor.dtype, torch.float32))
+
+
+def _rows(maps: Tensor) -> int:
+    """Of all samples (B, C, H, W) together."""
+    return maps.shape[0] * maps.shape[2]
 
 
 def _array(tensor: Tensor) -> np.ndarray:
@@ -122,12 +128,12 @@ def _padded(tensor: Tensor, radius: int) -> np.ndarray:
     return F.pad(tensor.detach(), (radius,) * 4).contiguous().numpy()
 
 
-@parallel
-def _forward(first: np.ndarray, padded: np.ndarray, out: np.ndarray) -> None:
-    batch, channels, height, width = first.shape
+@tasks
+def _forward(begin: int, end: int, first: np.ndarray, padded: np.ndarray, out: np.ndarray) -> None:
+    _, channels, height, width = first.shape
     size = padded.shape[2] - height + 1
     scale = np.float32(1.0 / channels)
-    for job in prange(batch * height):
+    for job in range(begin, end):
         b, y = job // height, job % height
         for dy in range(size):
             for dx in range(size):
@@ -141,13 +147,13 @@ def _forward(first: np.ndarray, padded: np.ndarray, out: np.ndarray) -> None:
                     total[x] *= scale
 
 
-@parallel
-def _backward(gradient: np.ndarray, padded: np.ndarray, out: np.ndarray) -> None:
+@tasks
+def _backward(begin: int, end: int, gradient: np.ndarray, padded: np.ndarray, out: np.ndarray) -> None:
     """out_c(x, y) += sum_d gradient_d(x, y) padded_c(x + d) / C; out comes in as zeros."""
-    batch, channels, height, width = out.shape
+    _, channels, height, width = out.shape
     size = padded.shape[2] - height + 1
     scale = np.float32(1.0 / channels)
-    for job in prange(batch * height):
+    for job in range(begin, end):
         b, y = job // height, job % height
         for c in range(channels):
             total = out[b, c, y]
@@ -158,12 +164,12 @@ def _backward(gradient: np.ndarray, padded: np.ndarray, out: np.ndarray) -> None
                 total[x] *= scale
 
 
-@parallel
-def _mirror(gradient: np.ndarray, radius: int, out: np.ndarray) -> None:
+@tasks
+def _mirror(begin: int, end: int, gradient: np.ndarray, radius: int, out: np.ndarray) -> None:
     """out_{-d}(p) = gradient_d(p - d), zero where p - d is outside."""
-    batch, displacements, height, width = gradient.shape
+    _, displacements, height, width = gradient.shape
     size = 2 * radius + 1
-    for job in prange(batch * displacements):
+    for job in range(begin, end):
         b, k = job // displacements, job % displacements
         dy, dx = k // size - radius, k % size - radius
         for y in range(height):
@@ -178,32 +184,33 @@ class _DisparityCorrelation(torch.autograd.Function):
         ctx.save_for_backward(left, right)
         batch, groups, _, height, width = left.shape
         out = torch.zeros((batch, groups, disparities, height, width))
-        _disparity_forward(_array(left), _array(right), out.numpy())
+        over_tasks(_disparity_forward, batch * groups * height, _array(left), _array(right), out.numpy())
         return out
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor, None]:
         left, right = ctx.saved_tensors
         to_left, to_right = torch.zeros(left.shape), torch.zeros(right.shape)
-        _disparity_backward(_array(left), _array(right), _array(gradient), to_left.numpy(), to_right.numpy())
+        rows, arrays = left[:, :, 0, :, 0].numel(), (_array(each) for each in (left, right, gradient))
+        over_tasks(_disparity_backward, rows, *arrays, to_left.numpy(), to_right.numpy())
         return to_left, to_right, None
 
 
-@parallel
-def _disparity_forward(left: np.ndarray, right: np.ndarray, out: np.ndarray) -> None:
-    batch, groups, channels, height, _ = left.shape
-    for job in prange(batch * groups * height):
+@tasks
+def _disparity_forward(begin: int, end: int, left: np.ndarray, right: np.ndarray, out: np.ndarray) -> None:
+    _, groups, channels, height, _ = left.shape
+    for job in range(begin, end):
         b, g, y = job // (groups * height), job // height % groups, job % height
         for d in range(out.shape[2]):
             for c in range(channels):
                 _multiply_add(left[b, g, c, y, d:], right[b, g, c, y], out[b, g, d, y, d:])
 
 
-@parallel
-def _disparity_backward(left: np.ndarray, right: np.ndarray, gradient: np.ndarray, to_left: np.ndarray,
-                        to_right: np.ndarray) -> None:
-    batch, groups, channels, height, _ = left.shape
-    for job in prange(batch * groups * height):
+@tasks
+def _disparity_backward(begin: int, end: int, left: np.ndarray, right: np.ndarray, gradient: np.ndarray,
+                        to_left: np.ndarray, to_right: np.ndarray) -> None:
+    _, groups, channels, height, _ = left.shape
+    for job in range(begin, end):
         b, g, y = job // (groups * height), job // height % groups, job % height
         for d in range(gradient.shape[2]):
             for c in range(channels):

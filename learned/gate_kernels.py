@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 
-from learned.jit import parallel, prange
+from learned.jit import tasks
 
 
-@parallel
-def gated_change(state: np.ndarray, values: np.ndarray, gates: np.ndarray, divisor: int, out: np.ndarray) -> None:
+@tasks
+def gated_change(first: int, last: int, state: np.ndarray, values: np.ndarray, gates: np.ndarray, divisor: int,
+                 out: np.ndarray) -> None:
     """The change of a state, as `learned.refiner` writes it down plainly.
 
     Parameters
     ----------
+    first, last : int
+        Rows of all B together; the last is excluded.
     state : np.ndarray
         (B, 5, H, W) float32, pixels.
     values : np.ndarray
@@ -24,9 +27,9 @@ def gated_change(state: np.ndarray, values: np.ndarray, gates: np.ndarray, divis
     out : np.ndarray
         (B, 5, H, W), the change.
     """
-    batch, _, height, width = state.shape
+    _, _, height, width = state.shape
     block = divisor * divisor
-    for task in prange(batch * height):
+    for task in range(first, last):
         b, y = task // height, task % height
         row, line = y // divisor, (y % divisor) * divisor
         for x in range(width):

@@ -15,8 +15,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from learned.bfloat16 import to_array
 from learned.local_kernels import local_backward, local_forward
 from learned.semi_global_kernels import semi_global_backward, semi_global_forward
+from learned.threads import over_tasks
 
 DIRECTIONS = ("down", "up", "right", "left")
 TERMS = 5
@@ -43,9 +45,9 @@ def semi_global_aggregation(cost: Tensor, guidance: Tensor) -> Tensor:
     batch, channels, _, height, width = cost.shape
     if guidance.shape != (batch, len(DIRECTIONS) * TERMS * channels, height, width):
         raise ValueError(f"guidance of shape {tuple(guidance.shape)} does not fit costs of shape {tuple(cost.shape)}")
-    if cost.device.type == "cpu" and cost.dtype in (torch.float32, torch.bfloat16):
-        aggregated: Tensor = _SemiGlobal.apply(cost, guidance.float())  # the recursion is in float32
-        return aggregated.to(cost.dtype)
+    if cost.device.type == "cpu" and {cost.dtype, guidance.dtype} <= {torch.float32, torch.bfloat16}:
+        aggregated: Tensor = _SemiGlobal.apply(cost, guidance)  # the recursion is in float32
+        return aggregated
     return semi_global_aggregation_reference(cost, guidance)
 
 
@@ -79,11 +81,12 @@ def _sweep(cost: Tensor, weights: Tensor, axis: int, backwards: bool) -> Tensor:
 class _SemiGlobal(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, cost: Tensor, guidance: Tensor) -> Tensor:
-        planes, weights = _planes(cost), _weights(guidance)
-        out = _large(planes.shape)
+        wanted = any(ctx.needs_input_grad)
+        planes, weights = _planes(cost, wanted), _weights(guidance, wanted)
+        out = _large(planes.shape, planes.dtype)
         # which of the four directions won: only the backward pass asks
-        chosen = torch.empty(planes.shape if any(ctx.needs_input_grad) else (0, 0, 0), dtype=torch.uint8)
-        semi_global_forward(planes.numpy(), weights.numpy(), out.numpy(), chosen.numpy())
+        chosen = torch.empty(planes.shape if wanted else (0, 0, 0), dtype=torch.uint8)
+        semi_global_forward(*(to_array(each) for each in (planes, weights, out, chosen)))
         ctx.save_for_backward(planes, weights, chosen)
         return _volume(out, cost)
 
@@ -91,31 +94,33 @@ class _SemiGlobal(torch.autograd.Function):
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor]:
         planes, weights, chosen = ctx.saved_tensors
         to_planes, to_weights = _large(planes.shape).zero_(), _large(weights.shape)
-        semi_global_backward(planes.numpy(), weights.numpy(), chosen.numpy(), _planes(gradient).numpy(),
-                             to_planes.numpy(), to_weights.numpy())
+        arrays = planes, weights, chosen, _planes(gradient, True), to_planes, to_weights
+        semi_global_backward(*(to_array(each) for each in arrays))
         return _volume(to_planes, gradient), to_weights.flatten(3).movedim(-1, 1)
 
 
-def _large(shape: Sequence[int]) -> Tensor:
-    """An uninitialised float32 tensor in numpy's memory, which asks for huge pages: a step of a sweep touches as many
-    pages as there are disparities."""
-    return torch.from_numpy(np.empty(tuple(shape), np.float32))
+def _large(shape: Sequence[int], dtype: torch.dtype = torch.float32) -> Tensor:
+    """An uninitialised tensor in numpy's memory, which asks for huge pages: a step of a sweep touches as many pages as
+    there are disparities."""
+    return torch.from_numpy(np.empty((*shape, dtype.itemsize), np.uint8)).view(dtype)[..., 0]
 
 
-def _planes(volume: Tensor) -> Tensor:
-    """(B, C, D, H, W) as (B, D, H * W * C) float32, the layout of the kernels: a view if the channels are innermost."""
-    return volume.detach().float().contiguous(memory_format=torch.channels_last_3d).permute(0, 2, 3, 4, 1).flatten(2)
+def _planes(volume: Tensor, precise: bool) -> Tensor:
+    """(B, C, D, H, W) as (B, D, H * W * C), the layout of the kernels: a view if the channels are innermost."""
+    volume = volume.detach().float() if precise else volume.detach()
+    return volume.contiguous(memory_format=torch.channels_last_3d).permute(0, 2, 3, 4, 1).flatten(2)
 
 
 def _volume(planes: Tensor, like: Tensor) -> Tensor:
-    """The (B, C, D, H, W) view of such planes."""
+    """The (B, C, D, H, W) view of such planes, of like's type."""
     batch, channels, depth, height, width = like.shape
-    return planes.view(batch, depth, height, width, channels).permute(0, 4, 1, 2, 3)
+    return planes.view(batch, depth, height, width, channels).permute(0, 4, 1, 2, 3).to(like.dtype)
 
 
-def _weights(guidance: Tensor) -> Tensor:
+def _weights(guidance: Tensor, precise: bool) -> Tensor:
     """(B, 4 * 5 * C, H, W) as (B, H, W, 4, 5, C): a view if the channels are innermost."""
-    return guidance.detach().movedim(1, -1).contiguous().unflatten(3, (len(DIRECTIONS), TERMS, -1))
+    guidance = guidance.detach().float() if precise else guidance.detach()
+    return guidance.movedim(1, -1).contiguous().unflatten(3, (len(DIRECTIONS), TERMS, -1))
 
 
 def local_aggregation(cost: Tensor, guidance: Tensor, times: int = 2) -> Tensor:
@@ -169,7 +174,8 @@ class _Local(torch.autograd.Function):
         cost, weights = cost.detach().contiguous(), weights.detach().contiguous()
         ctx.save_for_backward(cost, weights)
         out = torch.empty_like(cost)
-        local_forward(cost.numpy(), weights.numpy(), out.numpy())
+        rows = cost.shape[0] * cost.shape[2]
+        over_tasks(local_forward, rows, cost.numpy(), weights.numpy(), out.numpy())
         return out
 
     @staticmethod
@@ -177,5 +183,6 @@ class _Local(torch.autograd.Function):
         cost, weights = ctx.saved_tensors
         gradient = gradient.contiguous()
         to_cost, to_weights = torch.zeros_like(cost), torch.zeros_like(weights)
-        local_backward(cost.numpy(), weights.numpy(), gradient.numpy(), to_cost.numpy(), to_weights.numpy())
+        rows, arrays = cost.shape[0] * cost.shape[2], (cost, weights, gradient, to_cost, to_weights)
+        over_tasks(local_backward, rows, *(each.numpy() for each in arrays))
         return to_cost, to_weights

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from numba import njit, prange
+from numba import njit
 from numba.core.compiler import CompilerBase, DefaultPassBuilder
 
-__all__ = ["lanes", "parallel", "prange"]
+__all__ = ["lanes", "tasks"]
 
 
 class _NoAlias(CompilerBase):
@@ -27,5 +27,5 @@ _FLAGS: dict[str, Any] = {"cache": True, "error_model": "numpy", "fastmath": {"c
 #: An inner loop over vector lanes. Its array arguments must not overlap, else LLVM could not vectorise it.
 lanes = njit(forceinline=True, pipeline_class=_NoAlias, **_FLAGS)
 
-#: An outermost loop, ``prange`` over independent tasks.
-parallel = njit(parallel=True, **_FLAGS)
+#: An outermost loop, over independent tasks ``first`` ... ``last`` - 1, for ``learned.threads.over_tasks``.
+tasks = njit(nogil=True, **_FLAGS)

@@ -8,20 +8,20 @@ from __future__ import annotations
 
 import numpy as np
 
-from learned.jit import lanes, parallel, prange
+from learned.jit import lanes, tasks
 
 # Disparities that share the loads of their weights.
 _ROWS = 4
 
 
-@parallel
-def local_forward(cost: np.ndarray, weights: np.ndarray, out: np.ndarray) -> None:
+@tasks
+def local_forward(first: int, last: int, cost: np.ndarray, weights: np.ndarray, out: np.ndarray) -> None:
     """out(d, y, x) = sum over the 75 taps of weight(tap, y, x) cost(d + dd, y + dy, x + dx), the centre where outside.
 
-    Shapes (B, D, H, W), (B, 75, H, W), (B, D, H, W).
+    Shapes (B, D, H, W), (B, 75, H, W), (B, D, H, W); the tasks are the rows of all B together.
     """
-    batch, depth, height, width = cost.shape
-    for task in prange(batch * height):
+    _, depth, height, width = cost.shape
+    for task in range(first, last):
         b, y = task // height, task % height
         inside = 2 <= y < height - 2 and width > 4
         # disparities from 1 on that are worked on together
@@ -83,15 +83,15 @@ def _border_row(cost: np.ndarray, weights: np.ndarray, b: int, d: int, y: int, o
         _multiply_add(weight[end:], centre[end:], total[end:])
 
 
-@parallel
-def local_backward(cost: np.ndarray, weights: np.ndarray, gradient: np.ndarray, to_cost: np.ndarray,
-                   to_weights: np.ndarray) -> None:
+@tasks
+def local_backward(first: int, last: int, cost: np.ndarray, weights: np.ndarray, gradient: np.ndarray,
+                   to_cost: np.ndarray, to_weights: np.ndarray) -> None:
     """Gradients with respect to the costs and to the normalised weights, both added to zeros.
 
     A row of the costs is gathered from the rows that looked at it, so that no two tasks write to one place.
     """
-    batch, depth, height, width = cost.shape
-    for task in prange(batch * height):
+    _, depth, height, width = cost.shape
+    for task in range(first, last):
         b, y = task // height, task % height
         for d in range(depth):
             own, centre, total = gradient[b, d, y], cost[b, d, y], to_cost[b, d, y]
