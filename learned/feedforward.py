@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import AbstractContextManager
+from functools import partial
 from itertools import pairwise
 from typing import Any, Literal, Protocol, runtime_checkable
 
@@ -10,11 +11,16 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
+from learned.threads import side_by_side
+
 Precision = Literal["auto", "float32", "bfloat16"]
 
 
 class DisparityNetwork(Protocol):
-    """Whatever maps (left, right), (B, 3, H, W) in [0, 1] BGR, to the left image's disparity (B, H, W) in pixels."""
+    """Whatever maps (left, right), (B, 3, H, W) in [0, 1] BGR, to the left image's disparity (B, H, W) in pixels.
+
+    One with a true attribute ``light`` may run side by side with itself: two passes take little memory.
+    """
 
     def __call__(self, left: Tensor, right: Tensor) -> Tensor: ...
 
@@ -69,8 +75,12 @@ class FeedforwardModule(nn.Module):
     def disparities(self, left1: Tensor, right1: Tensor, left2: Tensor, right2: Tensor) -> Tensor:
         """D1 and D2 alone, (B, 2, H, W)."""
         size = left1.shape[0], *left1.shape[2:]
+        first, second = partial(self.disparity, left1, right1), partial(self.disparity, left2, right2)
         with mixed_precision(self.precision, left1.device):
-            d1, d2 = self.disparity(left1, right1), self.disparity(left2, right2)
+            if left1.device.type == "cpu" and not torch.is_grad_enabled() and getattr(self.disparity, "light", False):
+                d1, d2 = side_by_side(first, second)
+            else:
+                d1, d2 = first(), second()
         if d1.shape != size or d2.shape != size:
             raise ValueError(f"the network must return disparity {size}, not {tuple(d1.shape)}")
         return torch.stack([d1, d2], 1)

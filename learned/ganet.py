@@ -96,6 +96,11 @@ class GANet(nn.Module):
             if isinstance(module, nn.Conv2d | nn.Conv3d):
                 nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
 
+    @property
+    def light(self) -> bool:
+        """Whether a pass takes so little memory that two may run side by side."""
+        return not self.config.full_resolution_head
+
     def forward(self, left: Tensor, right: Tensor) -> Tensor:
         """Disparity (B, H, W) in pixels, float32: left(x, y) matches right(x - disparity, y)."""
         height, width = left.shape[-2:]

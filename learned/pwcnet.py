@@ -8,12 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from learned.correlation import correlation
+from learned.threads import side_by_side
 from learned.transposed import DoublingConvolution2d
 from learned.warp import warp
 
@@ -97,8 +99,15 @@ class PWCNet(nn.Module):
         return self._full_resolution(finest, first.shape)
 
     def both_ways(self, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
-        """``forward(first, second)`` and ``forward(second, first)`` with one feature pyramid and one decoding of both."""
-        pyramid = self._pyramid(self._pad(first), self._pad(second))
+        """``forward(first, second)`` and ``forward(second, first)`` with one feature pyramid of each image."""
+        images = self._pad(first), self._pad(second)
+        if first.device.type == "cpu" and not torch.is_grad_enabled():
+            one, other = side_by_side(*(partial(self._pyramid, image) for image in images))
+            there, back = zip(one, other, strict=True), zip(other, one, strict=True)
+            finest = side_by_side(*(partial(self._decode, pairs) for pairs in (list(there), list(back))))
+            forward, backward = (self._full_resolution(motions[-1], first.shape) for motions in finest)
+            return forward, backward
+        pyramid = self._pyramid(torch.cat(images))
         pairs = [(features, torch.cat(features.chunk(2)[::-1])) for features in pyramid]
         forward, backward = self._full_resolution(self._decode(pairs)[-1], first.shape).chunk(2)
         return forward, backward
@@ -119,12 +128,13 @@ class PWCNet(nn.Module):
         cells = 2 ** len(self.config.pyramid)
         if first.shape[-2] % cells or first.shape[-1] % cells:
             raise ValueError(f"image sides must be multiples of {cells}, not {tuple(first.shape[-2:])}")
-        return self._decode([features.chunk(2) for features in self._pyramid(first, second)])
+        # both images as one batch: fewer and larger convolutions
+        return self._decode([features.chunk(2) for features in self._pyramid(torch.cat([first, second]))])
 
-    def _pyramid(self, first: Tensor, second: Tensor) -> list[Tensor]:
-        """Features of every level, fine to coarse, of both images as one batch: fewer and larger convolutions."""
+    def _pyramid(self, images: Tensor) -> list[Tensor]:
+        """Features of every level, fine to coarse."""
         # channels innermost: half as fast again on a CPU, four times as fast in bfloat16
-        images = torch.cat([first, second]).contiguous(memory_format=torch.channels_last)
+        images = images.contiguous(memory_format=torch.channels_last)
         features = []
         for level in self.pyramid:
             images = level(images)

@@ -52,17 +52,20 @@ def _work(kernel: Callable[..., None], ranges: Iterator[tuple[int, int]], argume
 def side_by_side(*tasks: Callable[[], Any]) -> list[Any]:
     """Results of functions that do not depend on one another, run at the same time, torch's threads shared out among them.
 
-    For inference on the CPU: no graphs are built. Small layers hardly gain from a second thread, and each of a layer's
-    threads waits for the last one, whatever holds that up; whole networks do not.
+    For inference on the CPU: no graphs are built; autocast is the caller's. Small layers hardly gain from a second thread,
+    and each of a layer's threads waits for the last one, whatever holds that up; whole networks do not.
     """
     threads = torch.get_num_threads()
+    if torch.is_grad_enabled():
+        raise ValueError("side by side no graph is built: enter torch.no_grad() or torch.inference_mode()")
     if threads == 1 or not torch.backends.openmp.is_available():  # other pools cannot be shared out
         return [task() for task in tasks]
     mode = torch.inference_mode if torch.is_inference_mode_enabled() else torch.no_grad
+    autocast, dtype = torch.is_autocast_enabled("cpu"), torch.get_autocast_dtype("cpu")
 
     def run(task: Callable[[], Any]) -> Any:
         torch.set_num_threads(max(1, threads // len(tasks)))
-        with mode():
+        with mode(), torch.autocast("cpu", dtype, enabled=autocast):
             return task()
 
     try:

@@ -40,6 +40,9 @@ def test_both_ways_are_two_passes():
     torch.testing.assert_close(forward, net(first, second), rtol=1e-4, atol=1e-4)
     torch.testing.assert_close(backward, net(second, first), rtol=1e-4, atol=1e-4)
     assert not torch.allclose(forward, backward, atol=0.01)
+    with torch.enable_grad():  # both as one batch, in place of side by side
+        for one, other in zip(net.both_ways(first, second), (forward, backward), strict=True):
+            torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-4)
 
 
 @torch.no_grad()

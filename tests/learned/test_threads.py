@@ -55,3 +55,13 @@ def test_an_error_side_by_side_arrives_and_the_number_of_threads_stays(threads):
     with pytest.raises(ValueError, match="in a thread"), torch.no_grad():
         side_by_side(lambda: 1, fails)
     assert torch.get_num_threads() == threads
+
+
+def test_side_by_side_takes_the_callers_precision_and_refuses_graphs():
+    def task():
+        return torch.ones(2, 2) @ torch.ones(2, 2)
+
+    with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
+        assert [result.dtype for result in side_by_side(task, task)] == [torch.bfloat16] * 2
+    with pytest.raises(ValueError, match="no graph is built"):
+        side_by_side(task, task)
