@@ -10,11 +10,14 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from learned.bfloat16 import to_array
 from learned.gate_kernels import gated_change as gate_kernel
+from learned.mixture_kernels import mixture as mixture_kernel
 from learned.threads import over_tasks
 
 # Channels of the state on left1's grid that are trusted, or not, together: D1; C, u and v. D2 lives on left2's grid.
@@ -122,25 +125,34 @@ class Neighbours:
     def __call__(self, maps: Tensor) -> list[Tensor]:
         """``maps(p + o_k)`` for each offset o_k; the border's values repeat outside."""
         height, width = maps.shape[-2:]
-        reach = self.reach
-        padded = F.pad(maps, (reach,) * 4, mode="replicate")
+        reach, padded = self.reach, self._pad(maps)
         return [padded[..., reach + dy : reach + dy + height, reach + dx : reach + dx + width] for dy, dx in self.offsets]
+
+    def _pad(self, maps: Tensor) -> Tensor:
+        return F.pad(maps, (self.reach,) * 4, mode="replicate")
 
     def contrasts(self, image: Tensor) -> Tensor:
         """(B, k, h, w): mean absolute difference of an image (B, c, h, w) to each neighbour's."""
         return torch.cat([(image - other).abs().mean(1, keepdim=True) for other in self(image)], 1)
 
-    def mixture(self, state: Tensor, preference: Tensor, reliability: Tensor) -> Tensor:
+    def mixture(
+        self, state: Tensor, preference: Tensor, contrasts: Tensor, sharpness: Tensor, reliability: Tensor
+    ) -> Tensor:  # fmt: skip
         """Weighted means of the neighbours' D1, C, u and v.
 
-        ``sum_k w_k(p) X(p + o_k)``, ``w = softmax_k(a_k(p) + r(p + o_k))``. Related: Park et al., Non-Local Spatial
-        Propagation Network, ECCV 2020 (there with learned offsets, on depth).
+        ``sum_k w_k(p) X(p + o_k)``, ``w = softmax_k(a_k(p) - s c_k(p) + r(p + o_k))``. Related: Park et al., Non-Local
+        Spatial Propagation Network, ECCV 2020 (there with learned offsets, on depth). Without a graph to build, on a CPU,
+        a kernel does it in one pass.
 
         Parameters
         ----------
         state : Tensor (B, 5, h, w)
         preference : Tensor (B, k, h, w)
             a.
+        contrasts : Tensor (B, k, h, w)
+            c, of an image.
+        sharpness : Tensor ()
+            s.
         reliability : Tensor (B, 2, h, w)
             r, of disparity and of motion.
 
@@ -148,6 +160,15 @@ class Neighbours:
         -------
         Tensor (B, 4, h, w)
         """
+        if _kernels_may(state):
+            out = torch.empty((state.shape[0], 4, *state.shape[2:]))
+            padded = self._pad(state[:, (0, 2, 3, 4)]).numpy(), self._pad(reliability.float()).contiguous().numpy()
+            maps, weight = (to_array(preference), contrasts.numpy()), np.float32(sharpness.item())
+            rows, offsets = state.shape[0] * state.shape[2], np.array(self.offsets)
+            over_tasks(mixture_kernel, rows, *padded, *maps, weight, offsets, self.reach, out.numpy())
+            return out
+        preference = preference.float() - sharpness * contrasts
+        reliability = reliability.float()
         means = []
         for group, channels in enumerate(_GROUPS):
             trust = torch.cat(self(reliability[:, group : group + 1]), 1)
@@ -158,6 +179,11 @@ class Neighbours:
                 total = torch.addcmul(total, weights[:, k : k + 1], other)
             means.append(total)
         return torch.cat(means, 1)
+
+
+def _kernels_may(state: Tensor) -> bool:
+    """Whether kernels, which build no graph, may take over."""
+    return state.device.type == "cpu" and state.dtype == torch.float32 and not torch.is_grad_enabled()
 
 
 def gated_change(state: Tensor, values: Tensor, gates: Tensor, grid: Grid) -> Tensor:
@@ -176,9 +202,9 @@ def gated_change(state: Tensor, values: Tensor, gates: Tensor, grid: Grid) -> Te
         from the neighbours, then from the camera, C from the second pair.
     grid : Grid
     """
-    if state.device.type == "cpu" and state.dtype == torch.float32 and not torch.is_grad_enabled():
+    if _kernels_may(state):
         change = torch.empty(state.shape)
-        arrays = (maps.contiguous().numpy() for maps in (state, values, gates))
+        arrays = state.contiguous().numpy(), values.contiguous().numpy(), gates.numpy()
         over_tasks(gate_kernel, state.shape[0] * state.shape[2], *arrays, grid.divisor, change.numpy())
         return change
     size = state.shape[-2], state.shape[-1]

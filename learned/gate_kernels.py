@@ -21,7 +21,7 @@ def gated_change(first: int, last: int, state: np.ndarray, values: np.ndarray, g
     values : np.ndarray
         (B, 13, h, w): neighbours' D1, C, u, v; the camera's C, u, v; the second pair's residual; the correction (5).
     gates : np.ndarray
-        (B, 5 divisor**2, h, w): five gates for each pixel of a block, in the order of a pixel shuffle.
+        (B, 5 divisor**2, h, w), with whatever strides: five gates for each pixel of a block, in the order of a pixel shuffle.
     divisor : int
         Side of a block.
     out : np.ndarray

@@ -177,13 +177,11 @@ class Refiner(nn.Module):
         camera, residual, beside = self._alternatives(view, picked, batch)
         features += [_signed_log(maps) for maps in beside]
         x = self.hidden(_planar(torch.cat(features, 1)))
-        correction, reliability, preference, gates = (
-            head(x).float().contiguous() for head in (self.correction, self.reliability, self.preference, self.gates)
-        )  # fmt: skip
+        correction, reliability, gates = (head(x).float() for head in (self.correction, self.reliability, self.gates))
+        preference = self.preference(x)
         correction = _CORRECTION_MOST_PX * (correction / _CORRECTION_MOST_PX).tanh()
         assert view.contrasts is not None
-        preference = preference - self.edge_sharpness * view.contrasts
-        mixture = self.neighbours.mixture(picked, preference, reliability)
+        mixture = self.neighbours.mixture(picked, preference, view.contrasts, self.edge_sharpness, reliability)
         values = torch.cat([mixture, camera, residual, correction], 1)
         own = _GATES * self.config.divisor**2
         gates, rival_gates = gates.tanh().tensor_split((own,), 1)
@@ -255,5 +253,7 @@ def _signed_log(maps: Tensor) -> Tensor:
 
 
 def _planar(maps: Tensor) -> Tensor:
-    """Channels innermost: half of a convolution's time."""
-    return maps.contiguous(memory_format=torch.channels_last)
+    """As convolutions want them: channels innermost, half of a convolution's time, and in autocast's type, all at once."""
+    device = maps.device.type
+    dtype = torch.get_autocast_dtype(device) if torch.is_autocast_enabled(device) else maps.dtype
+    return maps.to(dtype, memory_format=torch.channels_last)

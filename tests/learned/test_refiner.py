@@ -99,13 +99,27 @@ def test_neighbours_that_are_trusted_outvote_a_wrong_pixel():
     state = torch.full((1, 5, 9, 9), 7.0)
     state[0, :, 4, 4] = 90.0
     neighbours = Neighbours((1,))
-    zero = torch.zeros(1, 8, 9, 9)
-    assert torch.allclose(neighbours.mixture(state, zero, torch.zeros(1, 2, 9, 9))[0, :, 4, 4], torch.tensor(7.0))
+    nothing = torch.zeros(1, 8, 9, 9), torch.zeros(1, 8, 9, 9), torch.tensor(0.0)
+    assert torch.allclose(neighbours.mixture(state, *nothing, torch.zeros(1, 2, 9, 9))[0, :, 4, 4], torch.tensor(7.0))
     reliability = torch.zeros(1, 2, 9, 9)
     reliability[0, 0, 4, 4] = -50.0  # of its disparity alone
-    mixture = neighbours.mixture(state, zero, reliability)
+    mixture = neighbours.mixture(state, *nothing, reliability)
     assert torch.allclose(mixture[0, 0], torch.tensor(7.0))
     assert mixture[0, 1:, 4, 5].min() > 15
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_the_mixture_kernel_does_what_is_written_plainly(dtype: torch.dtype):
+    generator = torch.Generator().manual_seed(0)
+    state, contrasts = 50 * torch.randn(2, 5, 9, 13, generator=generator), torch.rand(2, 16, 9, 13, generator=generator)
+    neighbours, reliability = Neighbours((1, 3)), 9 * torch.randn(2, 2, 9, 13, generator=generator)
+    # as a convolution leaves it: channels innermost
+    preference = (9 * torch.randn(2, 16, 9, 13, generator=generator)).to(dtype).to(memory_format=torch.channels_last)
+    arguments = state, preference, contrasts, torch.tensor(7.0), reliability
+    plain = neighbours.mixture(*arguments)
+    with torch.no_grad():
+        assert torch.allclose(neighbours.mixture(*arguments), plain, rtol=1e-5, atol=1e-4)
+        assert not torch.allclose(neighbours.mixture(-state, *arguments[1:]), plain, atol=1)
 
 
 def test_contrasts_are_those_of_the_neighbours():

@@ -1,0 +1,84 @@
+"""CPU kernel of the refiner's neighbours: weighted means of what they say, in one pass over the image."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from learned.bfloat16 import widen
+from learned.elementary import exponential
+from learned.jit import lanes, tasks
+
+
+@tasks
+def mixture(first: int, last: int, values: np.ndarray, reliability: np.ndarray, preference: np.ndarray, contrasts: np.ndarray,
+            sharpness: float, offsets: np.ndarray, reach: int, out: np.ndarray) -> None:
+    """``sum_k w_k(p) X(p + o_k)``, ``w = softmax_k(a_k(p) - sharpness * contrast_k(p) + r(p + o_k))``.
+
+    Parameters
+    ----------
+    first, last : int
+        Rows of all B together; the last is excluded.
+    values : np.ndarray
+        (B, 4, h + 2 reach, w + 2 reach) float32: X = D1, C, u, v.
+    reliability : np.ndarray
+        (B, 2, h + 2 reach, w + 2 reach) float32: r, of D1 and of the motion.
+    preference, contrasts : np.ndarray
+        (B, k, h, w), the first float32 or uint16: a, with whatever strides.
+    sharpness : float
+    offsets : np.ndarray
+        (k, 2) of rows and columns, at most `reach`.
+    out : np.ndarray
+        (B, 4, h, w) float32.
+    """
+    count, height, width = contrasts.shape[1:]
+    own, logits = np.empty((count, width), np.float32), np.empty((count, width), np.float32)
+    most, total, sums = np.empty(width, np.float32), np.empty(width, np.float32), np.empty((4, width), np.float32)
+    for task in range(first, last):
+        b, y = task // height, task % height
+        for k in range(count):
+            for x in range(width):
+                own[k, x] = widen(preference[b, k, y, x]) - sharpness * contrasts[b, k, y, x]
+        for group in range(2):
+            channels = (0, 1) if group == 0 else (1, 4)
+            most[:] = -np.inf
+            for k in range(count):
+                there, begin = y + reach + offsets[k, 0], reach + offsets[k, 1]
+                _add_and_compare(own[k], reliability[b, group, there, begin:], logits[k], most)
+            total[:] = 0
+            sums[:] = 0
+            for k in range(count):
+                there, begin = y + reach + offsets[k, 0], reach + offsets[k, 1]
+                _weigh(logits[k], most, total)
+                for c in range(channels[0], channels[1]):
+                    _accumulate(logits[k], values[b, c, there, begin:], sums[c])
+            for c in range(channels[0], channels[1]):
+                _divide(sums[c], total, out[b, c, y])
+
+
+@lanes
+def _add_and_compare(own: np.ndarray, trust: np.ndarray, logits: np.ndarray, most: np.ndarray) -> None:
+    for x in range(most.size):
+        logit = own[x] + trust[x]
+        logits[x] = logit
+        most[x] = logit if logit > most[x] else most[x]
+
+
+@lanes
+def _weigh(logits: np.ndarray, most: np.ndarray, total: np.ndarray) -> None:
+    """Logits become weights that are not normalised yet."""
+    for x in range(most.size):
+        weight = exponential(logits[x] - most[x])
+        logits[x] = weight
+        total[x] += weight
+
+
+@lanes
+def _accumulate(weights: np.ndarray, values: np.ndarray, sums: np.ndarray) -> None:
+    for x in range(sums.size):
+        sums[x] += weights[x] * values[x]
+
+
+@lanes
+def _divide(sums: np.ndarray, total: np.ndarray, out: np.ndarray) -> None:
+    for x in range(total.size):
+        out[x] = sums[x] / total[x]
