@@ -7,11 +7,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from functools import partial
 
 import numpy as np
 
 from variational.frames import Frames
-from variational.jit import over_rows, rowwise, total
+from variational.jit import over_rows, rowwise, side_by_side, total
 from variational.state import check_state
 from variational.terms.coupling import coupling_band, scatter_band
 from variational.terms.photometric import padded_planes, photometric_band, window_overlap
@@ -193,14 +194,14 @@ class Energy:
         """What does not depend on the state, prepared once for each type."""
         if dtype not in self._prepared:
             frames, sharpness = self.frames, self.config.edge_sharpness
-            left1, right1, left2, right2 = (padded_planes(image, dtype)
-                                            for image in (frames.left1, frames.right1, frames.left2, frames.right2))
+            edges1, edges2, left1, right1, left2, right2 = side_by_side(
+                *(partial(edge_weights, image, sharpness, dtype) for image in (frames.left1, frames.left2)),
+                *(partial(padded_planes, image, dtype) for image in (frames.left1, frames.right1, frames.left2, frames.right2)))
             channels = left1.shape[0]
             backward = np.zeros((2, 1), dtype) if self.backward_flow is None else flow_planes(self.backward_flow, dtype)
             self._prepared[dtype] = (
                 left1, right1.reshape(channels, -1), left2, right2.reshape(channels, -1), left2.reshape(channels, -1),
-                edge_weights(frames.left1, sharpness, dtype), edge_weights(frames.left2, sharpness, dtype), backward,
-                window_overlap(frames.shape[0], dtype), window_overlap(frames.shape[1], dtype))
+                edges1, edges2, backward, window_overlap(frames.shape[0], dtype), window_overlap(frames.shape[1], dtype))
         return self._prepared[dtype]
 
 

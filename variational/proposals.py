@@ -1,21 +1,24 @@
 """From a start to a state in which every pixel moves as it was seen to, or as something rigid does.
 
-The order of things: correspondences of the start -> rigid motions -> a choice per pixel between measured and rigid
-motion -> unmatched disparities filled again, now with the second time's evidence -> the choice once more.
+The order of things: correspondences of the start -> rigid motions; planes for what has no texture -> a choice per pixel
+between measured and rigid motion -> unmatched disparities filled again, now with the second time's evidence -> the choice
+once more.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
 from variational.camera import StereoCamera
 from variational.evidence import EvidenceConfig, refill
+from variational.frames import Frames
 from variational.fusion import FusionConfig, choose, motion_costs
 from variational.initialise import Start, sample
 from variational.jit import over_rows, rowwise, side_by_side
-from variational.matching import MatchingConfig
+from variational.matching import MatchingConfig, StereoMatch
 from variational.objects import ObjectsConfig, find_landmarks, find_objects, unexplained_surfaces
+from variational.planes import PlanesConfig, plane_disparities
 from variational.rigid import Correspondences, RigidConfig, RigidMotion, displacements, find_motions, guess_camera
 from variational.state import D1, C, flow_of
 from variational.visibility import project_visibility
@@ -120,16 +123,15 @@ def _take(
 
 
 def propose(
-    start: Start, grey: np.ndarray, grey2: np.ndarray, camera: StereoCamera | None, matching: MatchingConfig, rigid: RigidConfig,
-    objects: ObjectsConfig, fusion: FusionConfig, evidence: EvidenceConfig,
+    start: Start, frames: Frames, camera: StereoCamera | None, matching: MatchingConfig, rigid: RigidConfig,
+    objects: ObjectsConfig, planes: PlanesConfig, fusion: FusionConfig, evidence: EvidenceConfig,
 ) -> Proposal:  # fmt: skip
     """Fuse the start with rigid motions.
 
     Parameters
     ----------
     start : Start
-    grey, grey2 : np.ndarray
-        (H, W) float32, left1 and left2.
+    frames : Frames
     camera : StereoCamera or None
         With it the motions are metric; without, see variational.rigid.
 
@@ -138,16 +140,22 @@ def propose(
     Proposal
     """
 
+    grey, _, grey2, _ = frames.grey
+
     def search() -> tuple[StereoCamera, list[RigidMotion]]:
         matches = correspondences(start)
         known = camera or guess_camera(matches, rigid)
         return known, find_motions(matches, known, rigid)
 
-    (known, motions), landmarks2 = side_by_side(search, lambda: find_landmarks(grey2, objects))
+    def fill_planes() -> StereoMatch:
+        return _with_planes(start.match1, frames.left1, planes)
+
+    (known, motions), landmarks2, match1 = side_by_side(search, lambda: find_landmarks(grey2, objects), fill_planes)
     if not motions:
         return keep(start)
     words = (start.match1.words_left, start.match2.words_left, start.match2.words_right)
     state = start.state.copy()
+    state[D1] = match1.disparity
 
     def fuse(objects_near: int) -> tuple[np.ndarray, np.ndarray]:
         """Labels and costs under the motions so far; writes the chosen motion to the state."""
@@ -173,12 +181,19 @@ def propose(
 
     homographies = np.stack([motion.homography for motion in motions])
     disparity, found = side_by_side(
-        lambda: refill(start.match1, start.match2, grey, labels, homographies, matching, evidence), lost_objects
+        lambda: refill(match1, start.match2, grey, labels, homographies, matching, evidence), lost_objects
     )
     state[D1] = disparity
     motions += found
     labels, cost = fuse(2)
     return Proposal(state, labels, motions, cost)
+
+
+def _with_planes(match: StereoMatch, image: np.ndarray, config: PlanesConfig) -> StereoMatch:
+    """A match in which disparities of planes are as good as matched ones where there are none."""
+    disparity = plane_disparities(image, match.disparity, match.matched, config)
+    planar = np.isfinite(disparity) & ~match.matched
+    return replace(match, disparity=np.where(planar, disparity, match.disparity), matched=match.matched | planar)
 
 
 def _candidates(state: np.ndarray, start: Start, motions: list[RigidMotion], labels_of: np.ndarray) -> np.ndarray:

@@ -53,11 +53,11 @@ def window_overlap(size: int, dtype: np.dtype | type) -> np.ndarray:
     1 each inside; 0 where there is no such pixel, 2 where a window reflects onto q. The adjoint of the mean in one
     axis.
     """
+    centres = np.arange(size)[:, None]
+    seen = np.abs(centres + [-1, 0, 1])
+    seen = np.maximum(np.where(seen < size, seen, 2 * size - 2 - seen), 0)  # as `reflect`
     counts = np.zeros((3, size), dtype)
-    for p in range(size):
-        for q in (p - 1, p, p + 1):
-            q = reflect.py_func(q, size)
-            counts[p - q + 1, q] += 1
+    np.add.at(counts, (centres - seen + 1, seen), 1)
     return counts
 
 
