@@ -95,9 +95,13 @@ def load_network(name: str) -> nn.Module:
         raise InputError(str(error)) from None
 
 
+def to_colour(image: np.ndarray) -> np.ndarray:
+    """(H, W, 1 or 3) -> (H, W, 3); grey is repeated."""
+    return np.broadcast_to(image, (*image.shape[:2], 3))
+
+
 def to_tensor(image: np.ndarray) -> Tensor:
     """(H, W, 1 or 3) -> (1, 3, H, W); grey is repeated."""
     import torch
 
-    colour = np.broadcast_to(image, (*image.shape[:2], 3))
-    return torch.from_numpy(np.ascontiguousarray(colour.transpose(2, 0, 1)))[None]
+    return torch.from_numpy(np.ascontiguousarray(to_colour(image).transpose(2, 0, 1)))[None]

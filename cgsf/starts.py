@@ -12,7 +12,7 @@ from cgsf.baselines import CompositionConfig, compose
 from cgsf.camera_motion import find_homography
 from cgsf.config import to_table
 from cgsf.errors import InputError
-from cgsf.feedforward import FeedforwardConfig, run_networks, to_tensor, weights_path
+from cgsf.feedforward import FeedforwardConfig, run_networks, to_colour, weights_path
 from cgsf.formats.files import read_bytes
 from cgsf.scene_flow import SceneFlow
 from variational.camera import StereoCamera
@@ -68,7 +68,8 @@ def start_maps(start: SceneFlow) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     float32 and finite: what it leaves open (NaN) is zero."""
     if start.backward_flow is None:
         raise InputError(f"the method {start.method!r} gives no backward flow: its states cannot be refined")
-    state = np.nan_to_num(start.state(), posinf=0, neginf=0)
+    state = start.state()
+    state = state if np.isfinite(state).all() else np.nan_to_num(state, posinf=0, neginf=0)
     backward = start.backward_flow.transpose(2, 0, 1)
     confidence = np.ones(start.shape, np.float32) if start.confidence is None else start.confidence
     return state, backward, np.stack([confidence, start.visible.astype(np.float32)])
@@ -80,11 +81,12 @@ def to_batch(frames: Frames, start: SceneFlow, camera: StereoCamera | None = Non
 
     from learned.batch import Batch
 
-    images = torch.stack([to_tensor(image) for image in (frames.left1, frames.right1, frames.left2, frames.right2)], 1)
+    # channels stay innermost in memory: the energy, which wants them there, need not copy them back
+    images = np.stack([to_colour(image) for image in (frames.left1, frames.right1, frames.left2, frames.right2)])
     maps = start_maps(start)
     homography = torch.from_numpy(find_homography(maps[0], maps[1].transpose(1, 2, 0), camera))[None]
     state, backward, evidence = (torch.from_numpy(np.ascontiguousarray(each))[None] for each in maps)
-    return Batch(images, None, state, backward, evidence, homography=homography)
+    return Batch(torch.from_numpy(images).permute(0, 3, 1, 2)[None], None, state, backward, evidence, homography=homography)
 
 
 def describe(config: StartConfig) -> dict[str, Any]:

@@ -11,12 +11,13 @@ under which the correspondences move most rigidly; the baseline is arbitrary, it
 
 import logging
 from dataclasses import dataclass
+from functools import partial
 
 import cv2
 import numpy as np
 
 from variational.camera import StereoCamera
-from variational.jit import over_rows, rowwise, scalar
+from variational.jit import over_rows, rowwise, scalar, side_by_side
 
 logger = logging.getLogger(__name__)
 
@@ -252,24 +253,27 @@ def _thin(valid: np.ndarray, count: int) -> np.ndarray:
     return indices[np.linspace(0, len(indices) - 1, count).astype(np.intp)] if len(indices) > count else indices
 
 
-def guess_camera(matches: Correspondences, config: RigidConfig) -> StereoCamera:
-    """A camera to fit rigid motions with where none is known; see the module's text."""
-    height, width = matches.valid.shape
+def guess_camera(matches: Correspondences, config: RigidConfig, shape: tuple[int, int] | None = None) -> StereoCamera:
+    """A camera to fit rigid motions with where none is known; see the module's text.
+
+    `shape`: (H, W) of the image, if the correspondences are those of a part of its pixels.
+    """
+    height, width = shape or matches.valid.shape
     centre = (width - 1) / 2, (height - 1) / 2
     candidates = [StereoCamera(focal * width, focal * width, *centre, 0.1) for focal in (0.7, 1.0, 1.4, 2.0)]
     chosen = _thin(matches.valid & (matches.first[..., 2] > 0.5), config.points)
     if len(chosen) < config.min_points:
         return candidates[1]
     first, second = (m.reshape(-1, 3)[chosen].astype(np.float64) for m in (matches.first, matches.second))
-    errors = []
-    for camera in candidates:
+
+    def error(camera: StereoCamera) -> float:
         transform = fit_motion(first, second, camera.projection())
         if transform is None:
-            errors.append(np.inf)
-            continue
+            return np.inf
         distance = np.linalg.norm(_apply(_homography(transform, camera), first) - second, axis=1)
-        errors.append(np.minimum(distance, config.tolerance_px).mean())
-    return candidates[int(np.argmin(errors))]
+        return float(np.minimum(distance, config.tolerance_px).mean())
+
+    return candidates[int(np.argmin(side_by_side(*(partial(error, camera) for camera in candidates))))]
 
 
 def _homography(transform: np.ndarray, camera: StereoCamera) -> np.ndarray:
@@ -319,6 +323,8 @@ def find_motions(matches: Correspondences, camera: StereoCamera, config: RigidCo
         logger.info("no rigid camera motion: %d correspondences", np.count_nonzero(left))
         return []
     motions = [ego]
+    if not config.max_objects:
+        return motions
     left &= ~ego.support
     pieces, order = _pieces(matches, left, config)
     for label in order:
