@@ -14,9 +14,12 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from learned.bfloat16 import to_array
 from learned.correlation import disparity_correlation
 from learned.guided_aggregation import local_aggregation, semi_global_aggregation
+from learned.threads import over_tasks
 from learned.transposed import DoublingConvolution3d
+from learned.upsampling_kernels import convex_upsampling as upsampling_kernel
 
 
 @dataclass(frozen=True)
@@ -324,9 +327,16 @@ def _expectation(probability: Tensor) -> Tensor:
 def convex_upsampling(disparity: Tensor, guidance: Tensor, factor: int) -> Tensor:
     """Every fine pixel is a convex combination of the 3 x 3 coarse ones around it (Teed and Deng, RAFT, ECCV 2020).
 
-    ``disparity`` (B, H, W), ``guidance`` (B, 9 * factor^2, H, W) before the softmax -> (B, factor H, factor W).
+    ``disparity`` (B, H, W), ``guidance`` (B, 9 * factor^2, H, W) before the softmax -> (B, factor H, factor W). Without a
+    graph to build, on a CPU, a kernel does it in one pass.
     """
     batch, height, width = disparity.shape
+    kernel_may = disparity.dtype == torch.float32 and guidance.dtype in (torch.float32, torch.bfloat16)
+    if disparity.device.type == "cpu" and kernel_may and not torch.is_grad_enabled():
+        out = torch.empty((batch, height * factor, width * factor))
+        innermost = to_array(guidance.movedim(1, -1).contiguous())
+        over_tasks(upsampling_kernel, batch * height, disparity.contiguous().numpy(), innermost, factor, out.numpy())
+        return out
     weights = guidance.to(disparity.dtype).view(batch, 9, factor**2, height, width).softmax(1)
     neighbours = F.unfold(F.pad(disparity[:, None], (1, 1, 1, 1), mode="replicate"), 3)
     return F.pixel_shuffle((weights * neighbours.view(batch, 9, 1, height, width)).sum(1), factor)[:, 0]

@@ -132,6 +132,17 @@ def test_convex_upsampling_keeps_planes_inside_their_neighbourhood():
     torch.testing.assert_close(convex_upsampling(disparity, sharp.view(1, 36, 4, 5), 2)[:, ::2, ::2], disparity)
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_the_upsampling_kernel_does_what_is_written_plainly(dtype):
+    generator = torch.Generator().manual_seed(1)
+    disparity = 50 * torch.rand(2, 5, 7, generator=generator)
+    guidance = (9 * torch.randn(2, 9 * 16, 5, 7, generator=generator)).to(dtype)
+    plain = convex_upsampling(disparity, guidance, 4)
+    for layout in (torch.contiguous_format, torch.channels_last):
+        with torch.no_grad():
+            torch.testing.assert_close(convex_upsampling(disparity, guidance.contiguous(memory_format=layout), 4), plain)
+
+
 @torch.no_grad()
 def test_folded_normalisation_changes_nothing():
     net = _seeded(GANet, SMALL_DISPARITY)
