@@ -1,46 +1,58 @@
-"""Moving objects that dense flow lost: found by sparse features in what no motion explains.
+"""Moving objects that dense flow lost: found as a whole in what no motion explains.
 
 Where no candidate motion makes the images agree, although the pixels should be seen at time 2, something moved in a way
-that dense flow could not follow. Local features are matched over the whole of left2 there, and each connected surface of
-those pixels gets a rigid fit of its own. Features: SIFT (Lowe 2004).
+that dense flow could not follow, mostly too far. A connected surface of such pixels is looked for in left2 as a template
+(normalised correlation under the surface's mask), dense inverse search begins anew from where it is found, and what that
+says of the surface's points gets a rigid fit of its own. Whether the motion is any good is for the fusion to say.
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import cv2
 import numpy as np
 
-from variational.initialise import Start, to_bytes
+from variational.initialise import Start, dense_inverse_search
 from variational.rigid import RigidMotion, fit_motion
+
+MARGIN = 16
+"""Pixels around a surface that dense inverse search sees too."""
 
 
 @dataclass(frozen=True)
 class ObjectsConfig:
-    """Search for objects by features.
+    """Search for lost objects.
 
     Parameters
     ----------
-    features : int
-        Most features in an image, the strongest; 0 leaves the search out.
+    most : int
+        Surfaces looked for, the largest; 0 leaves the search out.
     cost : float
         A pixel is unexplained if its chosen motion costs more than this (variational.fusion), in [0, 1].
     least_px : int
         Fewest unexplained pixels of a surface.
+    largest : float
+        Share of the image above which a surface is the scene, not an object.
     jump_px : float
         A difference of disparity between neighbours that separates two surfaces.
-    ratio : float
-        A feature is matched if its best match is this much closer than the second best.
-    least_matches : int
-        Fewest matched features that a motion is fitted to, and must explain.
+    reach : float
+        Largest displacement along x and y, as a share of the image's width.
+    template_px : int
+        Side of the square whose area a template is reduced to.
+    least_points : int
+        Fewest points that a motion is fitted to.
+    inliers : float
+        Share of them that it must explain.
     """
 
-    features: int = 2500
+    most: int = 12
     cost: float = 0.45
     least_px: int = 150
+    largest: float = 0.25
     jump_px: float = 1.5
-    ratio: float = 0.85
-    least_matches: int = 6
+    reach: float = 0.15
+    template_px: int = 48
+    least_points: int = 30
+    inliers: float = 0.4
 
 
 def unexplained_surfaces(
@@ -53,64 +65,84 @@ def unexplained_surfaces(
         jump = np.abs(np.diff(disparity, axis=axis)) > config.jump_px
         open_[(slice(None),) * axis + (slice(1, None),)][jump] = 0
     _, labels, statistics, _ = cv2.connectedComponentsWithStats(open_, connectivity=4)
-    order = np.argsort(-statistics[1:, cv2.CC_STAT_AREA], kind="stable")[:24] + 1
-    return [labels == k for k in order if statistics[k, cv2.CC_STAT_AREA] >= config.least_px]
+    areas = statistics[:, cv2.CC_STAT_AREA].copy()
+    areas[0] = 0
+    areas[areas > config.largest * labels.size] = 0
+    order = np.argsort(-areas, kind="stable")[: config.most]
+    return [labels == k for k in order if areas[k] >= config.least_px]
 
 
-class Landmarks(NamedTuple):
-    """Features of an image: (N, 2) places (x, y) in pixels, (N, 128) float32 descriptions."""
-
-    places: np.ndarray
-    words: np.ndarray
-
-
-def find_landmarks(grey: np.ndarray, config: ObjectsConfig, mask: np.ndarray | None = None) -> Landmarks:
-    """The strongest features of a (H, W) image in [0, 1]; of those only what lies in a (H, W) uint8 mask."""
-    if config.features == 0:
-        return Landmarks(np.empty((0, 2)), np.empty((0, 128), np.float32))
-    detector = cv2.SIFT.create(nfeatures=config.features, contrastThreshold=0.01)
-    # SIFT doubles an image before it begins: halved, its first octave is the image itself, in a quarter of the time
-    half = (grey.shape[1] // 2, grey.shape[0] // 2)
-    small = to_bytes(cv2.resize(grey, half, interpolation=cv2.INTER_AREA))
-    mask = mask if mask is None else cv2.resize(mask, half, interpolation=cv2.INTER_NEAREST)
-    points, words = detector.detectAndCompute(small, mask)
-    places = (np.array([point.pt for point in points]).reshape(-1, 2) + 0.5) * (np.array(grey.shape[::-1]) / half) - 0.5
-    return Landmarks(places, np.empty((0, 128), np.float32) if words is None else words)
-
-
-def match_words(words1: np.ndarray, words2: np.ndarray, ratio: float) -> tuple[np.ndarray, np.ndarray]:
-    """Descriptions of one image that are much closer to one of another's than to all else of it.
-
-    All pairs at once, by one product of matrices. Descriptions are whole numbers up to 255, so their products are exact in
-    float32, in whatever order they are summed.
+def find_template(template: np.ndarray, mask: np.ndarray, image: np.ndarray, side_px: int) -> tuple[int, int] | None:
+    """Where in an image something is seen again.
 
     Parameters
     ----------
-    words1, words2 : np.ndarray
-        (N, 128), (M, 128) float32, M >= 2.
-    ratio : float
-        Least distance of the second best, as a share of which the best's must be less.
+    template, mask : np.ndarray
+        (h, w) float32 grey values, and bool where they count.
+    image : np.ndarray
+        (H, W) float32, H >= h, W >= w.
+    side_px : int
+        Templates larger than such a square are compared at a reduced size.
 
     Returns
     -------
-    places, partners : np.ndarray
-        (n,) indices into the first image's, and into the second's.
+    tuple of two int or None
+        Column and row of the template's corner in the image; None if nothing there can be compared.
     """
-    squares1, squares2 = (np.einsum("ij,ij->i", words, words) for words in (words1, words2))
-    distances = squares2 - 2 * (words1 @ words2.T)
-    partners, rows = distances.argmin(axis=1), np.arange(len(words1))
-    best = distances[rows, partners]
-    distances[rows, partners] = np.inf
-    second = distances.min(axis=1)
-    places = np.flatnonzero(best + squares1 < ratio**2 * (second + squares1))
-    return places, partners[places]
+    factor = max(1.0, np.sqrt(template.size / side_px**2))
+    shapes = [tuple(max(1, round(side / factor)) for side in plane.shape[::-1]) for plane in (template, image)]
+    small, where = (
+        cv2.resize(plane.astype(np.float32), shapes[0], interpolation=cv2.INTER_AREA) for plane in (template, mask)
+    )
+    searched = cv2.resize(image, shapes[1], interpolation=cv2.INTER_AREA)
+    scores = cv2.matchTemplate(searched, small, cv2.TM_CCOEFF_NORMED, mask=(where > 0.5).astype(np.float32))
+    scores[~(np.abs(scores) <= 1.001)] = -1  # not a number, or the quotient of two nothings, where all is flat
+    if scores.max() <= 0:
+        return None
+    row, column = np.unravel_index(scores.argmax(), scores.shape)
+    return round(column * image.shape[1] / shapes[1][0]), round(row * image.shape[0] / shapes[1][1])
+
+
+def _crop(image: np.ndarray, top: int, left: int, height: int, width: int) -> np.ndarray:
+    """Part of an image; positions outside take the nearest pixel."""
+    rows = np.clip(np.arange(top, top + height), 0, image.shape[0] - 1)
+    columns = np.clip(np.arange(left, left + width), 0, image.shape[1] - 1)
+    return image[rows[:, None], columns]
+
+
+def follow(left1: np.ndarray, left2: np.ndarray, surface: np.ndarray, config: ObjectsConfig) -> np.ndarray | None:
+    """(N, 4) x, y at time 1 and at time 2 of a surface's pixels, far displacements included; None if it is not seen again.
+
+    Parameters
+    ----------
+    left1, left2 : np.ndarray
+        (H, W) float32 grey images in [0, 1].
+    surface : np.ndarray
+        (H, W) bool.
+    config : ObjectsConfig
+    """
+    rows, columns = (np.flatnonzero(surface.any(axis=axis)) for axis in (1, 0))
+    top, left, height, width = (int(n) for n in (rows[0], columns[0], np.ptp(rows) + 1, np.ptp(columns) + 1))
+    part = slice(top, top + height), slice(left, left + width)
+    reach = round(config.reach * surface.shape[1])
+    searched = _crop(left2, top - reach, left - reach, height + 2 * reach, width + 2 * reach)
+    found = find_template(left1[part], surface[part], searched, config.template_px)
+    if found is None:
+        return None
+    right, down = found[0] - reach, found[1] - reach
+    top, left, height, width = top - MARGIN, left - MARGIN, height + 2 * MARGIN, width + 2 * MARGIN
+    around = _crop(left1, top, left, height, width), _crop(left2, top + down, left + right, height, width)
+    flow = dense_inverse_search(*around).astype(np.float64) + (right, down)
+    y, x = np.nonzero(surface)
+    places = np.column_stack([x, y])
+    return np.hstack([places, places + flow[y - top, x - left]])
 
 
 def find_objects(
-    start: Start, disparity: np.ndarray, left1: np.ndarray, landmarks2: Landmarks, surfaces: list[np.ndarray],
-    projection: np.ndarray, config: ObjectsConfig,
+    start: Start, disparity: np.ndarray, left1: np.ndarray, left2: np.ndarray, surfaces: list[np.ndarray],
+    projection: np.ndarray, config: ObjectsConfig, most_points: int = 400,
 ) -> list[RigidMotion]:  # fmt: skip
-    """Rigid motions of surfaces, from sparse features.
+    """Rigid motions of surfaces that dense flow lost.
 
     Parameters
     ----------
@@ -118,46 +150,42 @@ def find_objects(
         For the disparity at time 2.
     disparity : np.ndarray
         (H, W) at time 1, pixels.
-    left1 : np.ndarray
+    left1, left2 : np.ndarray
         (H, W) grey in [0, 1].
-    landmarks2 : Landmarks
-        Of left2.
     surfaces : list of np.ndarray
         (H, W) bool masks.
     projection : np.ndarray
         (4, 4) of the camera.
+    config : ObjectsConfig
+    most_points : int
+        Points of a surface that a motion is fitted to, drawn evenly.
 
     Returns
     -------
     list of RigidMotion
-        One for each surface whose features agree on a motion.
+        One for each surface that is seen again and moves rigidly.
     """
-    if not surfaces or len(landmarks2.places) < 2:
-        return []
-    around = cv2.dilate(np.any(surfaces, axis=0).astype(np.uint8), np.ones((9, 9), np.uint8))
-    landmarks1 = find_landmarks(left1, config, around)
-    if len(landmarks1.places) < config.least_matches:
-        return []
-    good, partners = match_words(landmarks1.words, landmarks2.words, config.ratio)
-    if len(good) < config.least_matches:
-        return []
-    at1, at2 = landmarks1.places[good], landmarks2.places[partners]
-    x1, y1, x2, y2 = np.rint(np.hstack([at1, at2])).astype(np.intp).T
-    first = np.column_stack([at1, disparity[y1, x1]])
-    second = np.column_stack([at2, start.match2.disparity[y2, x2]])
-    usable = (first[:, 2] > 0.5) & start.match2.matched[y2, x2] & (second[:, 2] > 0.5)
+    height, width = disparity.shape
     motions = []
     for surface in surfaces:
-        near = cv2.dilate(surface.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
-        chosen = np.flatnonzero(usable & near[y1, x1])
-        if len(chosen) < config.least_matches:
+        followed = follow(left1, left2, surface, config)
+        if followed is None:
             continue
+        x1, y1, x2, y2 = np.rint(followed).astype(np.intp).T
+        inside = (x2 >= 0) & (x2 < width) & (y2 >= 0) & (y2 < height)
+        followed, x1, y1, x2, y2 = followed[inside], x1[inside], y1[inside], x2[inside], y2[inside]
+        first = np.column_stack([followed[:, :2], disparity[y1, x1]])
+        second = np.column_stack([followed[:, 2:], start.match2.disparity[y2, x2]])
+        usable = np.flatnonzero((first[:, 2] > 0.5) & (second[:, 2] > 0.5) & start.match2.matched[y2, x2])
+        if len(usable) < config.least_points:
+            continue
+        chosen = usable[np.linspace(0, len(usable) - 1, min(most_points, len(usable))).astype(np.intp)]
         transform = fit_motion(first[chosen], second[chosen], projection)
         if transform is None:
             continue
         homography = projection @ transform @ np.linalg.inv(projection)
         moved = np.column_stack([first[chosen], np.ones(len(chosen))]) @ homography.T
         distance = np.linalg.norm(moved[:, :3] / moved[:, 3:] - second[chosen], axis=1)
-        if np.count_nonzero(distance < 2.0) >= config.least_matches:
+        if np.mean(distance < 2.0) >= config.inliers:
             motions.append(RigidMotion(transform, homography, surface))
     return motions

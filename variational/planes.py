@@ -13,8 +13,8 @@ import numpy as np
 
 from variational.jit import over_rows, rowwise
 
-HYPOTHESES = 64
-"""Planes tried in one fit: a third of the points on the plane suffices, for one in 27 is right then."""
+HYPOTHESES = 160
+"""Planes tried in one fit: a third of the points on one suffices, for every 27th is right then."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class PlanesConfig:
     margin_px: float = 4.0
     tolerance_px: float = 1.0
     tolerance: float = 0.02
-    support: float = 0.15
+    support: float = 0.2
     explained: float = 0.5
 
 

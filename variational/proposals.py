@@ -17,7 +17,7 @@ from variational.fusion import FusionConfig, choose, motion_costs
 from variational.initialise import Start, sample
 from variational.jit import over_rows, rowwise, side_by_side
 from variational.matching import MatchingConfig, StereoMatch
-from variational.objects import ObjectsConfig, find_landmarks, find_objects, unexplained_surfaces
+from variational.objects import ObjectsConfig, find_objects, unexplained_surfaces
 from variational.planes import PlanesConfig, plane_disparities
 from variational.rigid import Correspondences, RigidConfig, RigidMotion, displacements, find_motions, guess_camera
 from variational.state import D1, C, flow_of
@@ -150,7 +150,7 @@ def propose(
     def fill_planes() -> StereoMatch:
         return _with_planes(start.match1, frames.left1, planes)
 
-    (known, motions), landmarks2, match1 = side_by_side(search, lambda: find_landmarks(grey2, objects), fill_planes)
+    (known, motions), match1 = side_by_side(search, fill_planes)
     if not motions:
         return keep(start)
     words = (start.match1.words_left, start.match2.words_left, start.match2.words_right)
@@ -177,7 +177,7 @@ def propose(
 
     def lost_objects() -> list[RigidMotion]:
         surfaces = unexplained_surfaces(state[D1], cost, project_visibility(state), objects)
-        return find_objects(start, state[D1], grey, landmarks2, surfaces, known.projection(), objects)
+        return find_objects(start, state[D1], grey, grey2, surfaces, known.projection(), objects)
 
     homographies = np.stack([motion.homography for motion in motions])
     disparity, found = side_by_side(

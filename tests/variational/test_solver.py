@@ -2,7 +2,6 @@
 
 import logging
 
-import cv2
 import numba
 import numpy as np
 import pytest
@@ -13,7 +12,6 @@ from variational.confidence import confidence
 from variational.descent import DescentConfig
 from variational.frames import Frames
 from variational.minimise import DescendConfig
-from variational.objects import ObjectsConfig, find_landmarks, match_words, unexplained_surfaces
 from variational.solver import SolverConfig, solve
 
 CAMERA = StereoCamera(80.0, 80.0, 53.5, 35.5, 0.5)
@@ -122,31 +120,6 @@ def test_confidence_doubts_what_was_not_seen():
     state[0, :, 8:] = 30
     beside = confidence(state, cost, sure, sure, sure)
     assert beside[6, 8] < beside[6, 2]
-
-
-def test_words_match_as_by_brute_force():
-    grey = cv2.GaussianBlur(np.random.default_rng(4).random((200, 240), dtype=np.float32), (0, 0), 2)
-    grey = (grey - grey.min()) / (grey.max() - grey.min())
-    words1, words2 = (find_landmarks(image, ObjectsConfig()).words for image in (grey, np.roll(grey, 7, axis=1)))
-    assert len(words1) > 50
-    assert (words1 == np.rint(words1)).all()  # what makes the product exact
-    places, partners = match_words(words1, words2, 0.85)
-    pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(words1, words2, k=2)
-    expected = [(m.queryIdx, m.trainIdx) for m, second in pairs if m.distance < 0.85 * second.distance]
-    assert 10 < len(expected) < len(words1)
-    assert list(zip(places, partners, strict=True)) == expected
-
-
-def test_surfaces_end_where_the_disparity_jumps():
-    disparity = np.full((30, 40), 5, np.float32)
-    disparity[:, 20:] = 9
-    cost = np.full((30, 40), 0.1, np.float32)
-    cost[5:25, 10:30] = 0.9
-    visible = np.ones((30, 40), bool)
-    surfaces = unexplained_surfaces(disparity, cost, visible, ObjectsConfig(least_px=50))
-    assert len(surfaces) == 2
-    assert all(150 < surface.sum() <= 200 for surface in surfaces)
-    assert not unexplained_surfaces(disparity, cost, ~visible, ObjectsConfig(least_px=50))
 
 
 def test_no_motion_is_invented_where_nothing_matches(caplog):

@@ -1,0 +1,111 @@
+"""Lost objects: found again where they went, and nothing where nothing is seen again."""
+
+import cv2
+import numpy as np
+import pytest
+
+from variational.camera import StereoCamera
+from variational.initialise import Start
+from variational.matching import StereoMatch
+from variational.objects import ObjectsConfig, find_objects, find_template, follow, unexplained_surfaces
+from variational.rigid import displacements
+
+SHAPE = (120, 200)
+PROJECTION = StereoCamera(150.0, 160.0, 90.0, 70.0, 0.5).projection()
+SHIFT = (27, -19)
+
+
+def texture(seed: int, shape: tuple[int, int] = SHAPE, blur: float = 1.5) -> np.ndarray:
+    image = cv2.GaussianBlur(np.random.default_rng(seed).random(shape, dtype=np.float32), (0, 0), blur)
+    return (image - image.min()) / (image.max() - image.min())
+
+
+def jumping_box(left: int = 60, top: int = 50) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """left1, left2 and where a box is that goes by SHIFT before a standing background."""
+    box, background = texture(1, (40, 50)), texture(2)
+    images = []
+    for right, down in ((0, 0), SHIFT):
+        wide = cv2.copyMakeBorder(background, 60, 60, 60, 60, cv2.BORDER_REFLECT)
+        wide[60 + top + down : 100 + top + down, 60 + left + right : 110 + left + right] = box
+        images.append(np.ascontiguousarray(wide[60:-60, 60:-60]))
+    surface = np.zeros(SHAPE, bool)
+    surface[max(top, 0) : top + 40, max(left, 0) : left + 50] = True
+    return images[0], images[1], surface
+
+
+def start_with(disparity: np.ndarray, matched: np.ndarray) -> Start:
+    """A start of which only the disparities at time 2 are asked."""
+    words = np.zeros((2, *SHAPE), np.uint64)
+    match = StereoMatch(disparity, matched, words, words, 30)
+    return Start(np.zeros((5, *SHAPE), np.float32), np.zeros((*SHAPE, 2), np.float32), match, match)
+
+
+def test_surfaces_end_where_the_disparity_jumps():
+    disparity = np.full((30, 40), 5, np.float32)
+    disparity[:, 20:] = 9
+    cost = np.full((30, 40), 0.1, np.float32)
+    cost[5:25, 10:30] = 0.9
+    visible = np.ones((30, 40), bool)
+    surfaces = unexplained_surfaces(disparity, cost, visible, ObjectsConfig(least_px=50))
+    assert len(surfaces) == 2
+    assert all(150 < surface.sum() <= 200 for surface in surfaces)
+    assert not unexplained_surfaces(disparity, cost, ~visible, ObjectsConfig(least_px=50))
+
+
+@pytest.mark.parametrize(("side", "tolerance"), [(64, 0), (20, 2)])
+def test_a_template_is_found_where_it_is(side: int, tolerance: int) -> None:
+    image = texture(0, blur=3)
+    mask = np.ones((40, 50), bool)
+    mask[:5] = False
+    template = image[31:71, 83:133].copy()
+    template[:5] = 0  # outside of the mask, so that it must not matter
+    column, row = find_template(template, mask, image, side)
+    assert abs(column - 83) <= tolerance
+    assert abs(row - 31) <= tolerance
+
+
+def test_what_is_flat_is_not_found() -> None:
+    flat = np.full((20, 30), 0.5, np.float32)
+    assert find_template(flat, np.ones(flat.shape, bool), np.full(SHAPE, 0.5, np.float32), 48) is None
+
+
+@pytest.mark.parametrize("corner", [(60, 50), (-12, 90)])
+def test_a_surface_is_followed_farther_than_dense_flow_does(corner: tuple[int, int]) -> None:
+    left1, left2, surface = jumping_box(*corner)
+    followed = follow(left1, left2, surface, ObjectsConfig(reach=0.2))
+    assert len(followed) == surface.sum()
+    moved = followed[:, 2:] - followed[:, :2]
+    assert (np.linalg.norm(moved - SHIFT, axis=1) < 0.5).mean() > 0.9
+
+
+def test_a_lost_box_gets_its_motion() -> None:
+    left1, left2, surface = jumping_box()
+    disparity = np.where(surface, 12, 5).astype(np.float32)
+    disparity2 = np.full(SHAPE, 5, np.float32)
+    disparity2[50 + SHIFT[1] : 90 + SHIFT[1], 60 + SHIFT[0] : 110 + SHIFT[0]] = 12
+    start = start_with(disparity2, np.ones(SHAPE, bool))
+    (motion,) = find_objects(start, disparity, left1, left2, [surface], PROJECTION, ObjectsConfig(reach=0.2))
+    labels = np.zeros((1, *SHAPE), np.int32)
+    change, u, v = displacements(motion.homography[None], labels, disparity)[0][:, surface]
+    assert abs(np.median(change)) < 0.2
+    assert abs(np.median(u) - SHIFT[0]) < 0.5
+    assert abs(np.median(v) - SHIFT[1]) < 0.5
+    np.testing.assert_array_equal(motion.support, surface)
+
+
+@pytest.mark.parametrize("case", ["no surface", "nothing rigid", "nothing matched"])
+def test_nothing_is_invented(case: str) -> None:
+    left1, left2, surface = jumping_box()
+    random = np.random.default_rng(5).uniform(3, 60, SHAPE).astype(np.float32)
+    disparity2 = random if case == "nothing rigid" else np.full(SHAPE, 12, np.float32)
+    start = start_with(disparity2, np.full(SHAPE, case != "nothing matched"))
+    surfaces = [] if case == "no surface" else [surface]
+    assert find_objects(start, np.full(SHAPE, 12, np.float32), left1, left2, surfaces, PROJECTION, ObjectsConfig()) == []
+
+
+def test_the_scene_is_no_object_and_only_the_largest_are_sought() -> None:
+    cost = np.zeros((60, 80), np.float32)
+    cost[:30] = cost[40:50, 5:35] = cost[40:50, 45:65] = 0.9
+    everywhere = np.ones(cost.shape, bool)
+    surfaces = unexplained_surfaces(np.full(cost.shape, 5, np.float32), cost, everywhere, ObjectsConfig(least_px=50, most=1))
+    assert [surface.sum() for surface in surfaces] == [300]
