@@ -11,6 +11,7 @@ import numpy as np
 
 from cgsf.errors import InputError
 from cgsf.scene_flow import SceneFlow
+from cgsf.threads import keep_freed_memory
 from variational.camera import StereoCamera
 from variational.frames import Frames
 from variational.terms.visibility import visible_mask
@@ -73,6 +74,7 @@ def _load_module(config: FeedforwardConfig, written: tuple[int, ...]) -> Feedfor
     """Both networks, ready to run; kept for the next frame as long as the files are those `written` at these times."""
     from learned.feedforward import FeedforwardModule, fold_normalisation
 
+    keep_freed_memory()
     disparity, motion = (fold_normalisation(load_network(name)) for name in (config.disparity, config.motion))
     return FeedforwardModule(disparity, motion, config.precision).eval().to(config.device)
 

@@ -1,9 +1,15 @@
-"""How many threads this process may use."""
+"""How many threads this process may use, and how its memory is kept for them."""
 
 from __future__ import annotations
 
+import ctypes
+import os
+
 import cv2
 import numba
+
+# Of glibc's malloc.h.
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
 
 
 def bound_threads(count: int, networks: bool = True) -> None:
@@ -29,3 +35,15 @@ def bound_threads(count: int, networks: bool = True) -> None:
         import torch
 
         torch.set_num_threads(count)
+
+
+def keep_freed_memory() -> None:
+    """Let the C library keep what is freed, up to 1 GiB, for the next layer of a network.
+
+    Otherwise it gives large arrays back at once, and the system hands out the same pages anew, zeroed one by one: a
+    twentieth of the hybrid's time. A C library that is not glibc is left as it is.
+    """
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if os.name == "posix" else None
+    if mallopt is not None:
+        mallopt(_M_MMAP_THRESHOLD, 32 << 20)  # the most that it takes
+        mallopt(_M_TRIM_THRESHOLD, 1 << 30)

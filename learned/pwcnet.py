@@ -187,8 +187,8 @@ class _Decoder(nn.Module):
         else:
             upsampled, features = coarser
             costs = self._costs(first, warp(second, upsampled[:, :2] * self.pixels))
-            dense = torch.cat([costs, first, upsampled.to(first.dtype), features], 1)
-        dense = dense.contiguous(memory_format=torch.channels_last)  # or every convolution would convert it again
+            dense = torch.cat([costs, first, _planar(upsampled, first.dtype), features], 1)
+        dense = _planar(dense, dense.dtype)  # or every convolution would convert it again
         for convolution in self.convolutions:
             dense = torch.cat([convolution(dense), dense], 1)
         if self.config.residual:
@@ -201,9 +201,8 @@ class _Decoder(nn.Module):
         if not self.config.cosine:
             return F.leaky_relu(correlation(first, second, self.config.radius), 0.1)
         dtype = first.dtype
-        # the mean over the channels of unit vectors would be tiny: the sum is the cosine
-        first, second = (_unit(features) * features.shape[1] ** 0.5 for features in (first, second))
-        return F.leaky_relu(correlation(first, second, self.config.radius).to(dtype), 0.1)
+        volume = correlation(_normalised(first), _normalised(second), self.config.radius)
+        return F.leaky_relu(_planar(volume, dtype), 0.1)
 
     def _upsample(self, motion: Tensor) -> Tensor:
         if self.config.residual:
@@ -221,11 +220,19 @@ def _precise(module: nn.Module, features: Tensor) -> Tensor:
         return module(_at_least_float32(features))
 
 
-def _unit(features: Tensor) -> Tensor:
-    """Features (B, C, H, W) of length one at every pixel, in float32 or better, channels outermost."""
+def _normalised(features: Tensor) -> Tensor:
+    """Features (B, C, H, W) of mean square one at every pixel, in float32 or better, channels outermost.
+
+    The mean product of two, which correlation takes, is then their cosine.
+    """
     features = _at_least_float32(features).contiguous()
     # bounded before the root: its slope is infinite at zero, where warping looked outside
-    return features / features.square().sum(1, keepdim=True).clamp(min=1e-24).sqrt()
+    return features * (features.shape[1] / features.square().sum(1, keepdim=True).clamp(min=1e-24)).sqrt()
+
+
+def _planar(maps: Tensor, dtype: torch.dtype) -> Tensor:
+    """Channels innermost, as convolutions want them, and in this type."""
+    return maps.to(dtype, memory_format=torch.channels_last)
 
 
 def _at_least_float32(tensor: Tensor) -> Tensor:
