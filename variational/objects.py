@@ -32,33 +32,42 @@ class ObjectsConfig:
         Fewest unexplained pixels of a surface.
     largest : float
         Share of the image above which a surface is the scene, not an object.
+    matched : float
+        Least share of its pixels that are matched at time 1.
     jump_px : float
         A difference of disparity between neighbours that separates two surfaces.
     reach : float
         Largest displacement along x and y, as a share of the image's width.
     template_px : int
         Side of the square whose area a template is reduced to.
+    flow_px : int
+        The same for dense inverse search on a surface and its surroundings.
     least_points : int
         Fewest points that a motion is fitted to.
     inliers : float
         Share of them that it must explain.
     """
 
-    most: int = 12
+    most: int = 8
     cost: float = 0.45
     least_px: int = 150
     largest: float = 0.25
+    matched: float = 0.5
     jump_px: float = 1.5
     reach: float = 0.15
-    template_px: int = 48
+    template_px: int = 32
+    flow_px: int = 160
     least_points: int = 30
     inliers: float = 0.4
 
 
 def unexplained_surfaces(
-    disparity: np.ndarray, cost: np.ndarray, visible: np.ndarray, config: ObjectsConfig
+    disparity: np.ndarray, cost: np.ndarray, visible: np.ndarray, matched: np.ndarray, config: ObjectsConfig
 ) -> list[np.ndarray]:
-    """Connected surfaces of pixels that no motion explains: (H, W) bool masks, the largest first."""
+    """Connected surfaces of pixels that no motion explains: (H, W) bool masks, the largest first.
+
+    What has no texture is never explained, but neither is it matched at time 1: such surfaces are left out.
+    """
     open_ = ((cost > config.cost) & visible).astype(np.uint8)
     open_ = cv2.morphologyEx(open_, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
     for axis in (0, 1):
@@ -66,8 +75,9 @@ def unexplained_surfaces(
         open_[(slice(None),) * axis + (slice(1, None),)][jump] = 0
     _, labels, statistics, _ = cv2.connectedComponentsWithStats(open_, connectivity=4)
     areas = statistics[:, cv2.CC_STAT_AREA].copy()
+    compared = np.bincount(labels[matched], minlength=len(areas))
+    areas[(areas > config.largest * labels.size) | (compared < config.matched * areas)] = 0
     areas[0] = 0
-    areas[areas > config.largest * labels.size] = 0
     order = np.argsort(-areas, kind="stable")[: config.most]
     return [labels == k for k in order if areas[k] >= config.least_px]
 
@@ -103,6 +113,15 @@ def find_template(template: np.ndarray, mask: np.ndarray, image: np.ndarray, sid
     return round(column * image.shape[1] / shapes[1][0]), round(row * image.shape[0] / shapes[1][1])
 
 
+def _flow_at_most(first: np.ndarray, second: np.ndarray, side_px: int) -> np.ndarray:
+    """(H, W, 2) dense inverse search, at a reduced size if the images are larger than such a square."""
+    height, width = first.shape
+    factor = max(1.0, np.sqrt(first.size / side_px**2))
+    size = max(MARGIN, round(width / factor)), max(MARGIN, round(height / factor))
+    small = [cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (first, second)]
+    return cv2.resize(dense_inverse_search(*small), (width, height)) * np.array([width / size[0], height / size[1]], np.float32)
+
+
 def _crop(image: np.ndarray, top: int, left: int, height: int, width: int) -> np.ndarray:
     """Part of an image; positions outside take the nearest pixel."""
     rows = np.clip(np.arange(top, top + height), 0, image.shape[0] - 1)
@@ -132,15 +151,15 @@ def follow(left1: np.ndarray, left2: np.ndarray, surface: np.ndarray, config: Ob
     right, down = found[0] - reach, found[1] - reach
     top, left, height, width = top - MARGIN, left - MARGIN, height + 2 * MARGIN, width + 2 * MARGIN
     around = _crop(left1, top, left, height, width), _crop(left2, top + down, left + right, height, width)
-    flow = dense_inverse_search(*around).astype(np.float64) + (right, down)
+    flow = _flow_at_most(*around, config.flow_px)
     y, x = np.nonzero(surface)
     places = np.column_stack([x, y])
-    return np.hstack([places, places + flow[y - top, x - left]])
+    return np.hstack([places, places + flow[y - top, x - left].astype(np.float64) + (right, down)])
 
 
 def find_objects(
     start: Start, disparity: np.ndarray, left1: np.ndarray, left2: np.ndarray, surfaces: list[np.ndarray],
-    projection: np.ndarray, config: ObjectsConfig, most_points: int = 400,
+    projection: np.ndarray, config: ObjectsConfig, most_points: int = 250,
 ) -> list[RigidMotion]:  # fmt: skip
     """Rigid motions of surfaces that dense flow lost.
 

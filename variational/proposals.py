@@ -176,7 +176,7 @@ def propose(
         return Proposal(state, labels, motions, cost)
 
     def lost_objects() -> list[RigidMotion]:
-        surfaces = unexplained_surfaces(state[D1], cost, project_visibility(state), objects)
+        surfaces = unexplained_surfaces(state[D1], cost, project_visibility(state), start.match1.matched, objects)
         return find_objects(start, state[D1], grey, grey2, surfaces, known.projection(), objects)
 
     homographies = np.stack([motion.homography for motion in motions])

@@ -45,11 +45,12 @@ def test_surfaces_end_where_the_disparity_jumps():
     disparity[:, 20:] = 9
     cost = np.full((30, 40), 0.1, np.float32)
     cost[5:25, 10:30] = 0.9
-    visible = np.ones((30, 40), bool)
-    surfaces = unexplained_surfaces(disparity, cost, visible, ObjectsConfig(least_px=50))
+    visible = matched = np.ones((30, 40), bool)
+    surfaces = unexplained_surfaces(disparity, cost, visible, matched, ObjectsConfig(least_px=50))
     assert len(surfaces) == 2
     assert all(150 < surface.sum() <= 200 for surface in surfaces)
-    assert not unexplained_surfaces(disparity, cost, ~visible, ObjectsConfig(least_px=50))
+    assert not unexplained_surfaces(disparity, cost, ~visible, matched, ObjectsConfig(least_px=50))
+    assert not unexplained_surfaces(disparity, cost, visible, ~matched, ObjectsConfig(least_px=50))
 
 
 @pytest.mark.parametrize(("side", "tolerance"), [(64, 0), (20, 2)])
@@ -107,5 +108,6 @@ def test_the_scene_is_no_object_and_only_the_largest_are_sought() -> None:
     cost = np.zeros((60, 80), np.float32)
     cost[:30] = cost[40:50, 5:35] = cost[40:50, 45:65] = 0.9
     everywhere = np.ones(cost.shape, bool)
-    surfaces = unexplained_surfaces(np.full(cost.shape, 5, np.float32), cost, everywhere, ObjectsConfig(least_px=50, most=1))
+    disparity, config = np.full(cost.shape, 5, np.float32), ObjectsConfig(least_px=50, most=1)
+    surfaces = unexplained_surfaces(disparity, cost, everywhere, everywhere, config)
     assert [surface.sum() for surface in surfaces] == [300]
