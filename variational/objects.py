@@ -51,8 +51,8 @@ class ObjectsConfig:
     most: int = 8
     cost: float = 0.45
     least_px: int = 150
-    largest: float = 0.25
-    matched: float = 0.5
+    largest: float = 0.1
+    matched: float = 0.2
     jump_px: float = 1.5
     reach: float = 0.15
     template_px: int = 32
@@ -190,6 +190,7 @@ def find_objects(
         followed = follow(left1, left2, surface, config)
         if followed is None:
             continue
+        followed = followed[np.linspace(0, len(followed) - 1, min(10 * most_points, len(followed))).astype(np.intp)]
         x1, y1, x2, y2 = np.rint(followed).astype(np.intp).T
         inside = (x2 >= 0) & (x2 < width) & (y2 >= 0) & (y2 < height)
         followed, x1, y1, x2, y2 = followed[inside], x1[inside], y1[inside], x2[inside], y2[inside]

@@ -62,7 +62,8 @@ def correspondences(start: Start, tolerance_px: float = 1.0) -> Correspondences:
     x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
     to_x, to_y = x + flow[..., 0], y + flow[..., 1]
     inside = (to_x >= 0) & (to_x <= width - 1) & (to_y >= 0) & (to_y <= height - 1)
-    there_and_back = np.linalg.norm(flow + sample(start.backward_flow, flow), axis=-1)
+    left_over = flow + sample(start.backward_flow, flow)
+    there_and_back = cv2.magnitude(left_over[..., 0], left_over[..., 1])
     matched2 = sample(start.match2.matched.astype(np.float32), flow) > 0.99
     valid = inside & (there_and_back < tolerance_px) & start.match1.matched & matched2
     second_disparity = sample(start.match2.disparity, flow)

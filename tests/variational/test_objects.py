@@ -46,11 +46,11 @@ def test_surfaces_end_where_the_disparity_jumps():
     cost = np.full((30, 40), 0.1, np.float32)
     cost[5:25, 10:30] = 0.9
     visible = matched = np.ones((30, 40), bool)
-    surfaces = unexplained_surfaces(disparity, cost, visible, matched, ObjectsConfig(least_px=50))
+    surfaces = unexplained_surfaces(disparity, cost, visible, matched, ObjectsConfig(least_px=50, largest=0.5))
     assert len(surfaces) == 2
     assert all(150 < surface.sum() <= 200 for surface in surfaces)
-    assert not unexplained_surfaces(disparity, cost, ~visible, matched, ObjectsConfig(least_px=50))
-    assert not unexplained_surfaces(disparity, cost, visible, ~matched, ObjectsConfig(least_px=50))
+    assert not unexplained_surfaces(disparity, cost, ~visible, matched, ObjectsConfig(least_px=50, largest=0.5))
+    assert not unexplained_surfaces(disparity, cost, visible, ~matched, ObjectsConfig(least_px=50, largest=0.5))
 
 
 @pytest.mark.parametrize(("side", "tolerance"), [(64, 0), (20, 2)])
