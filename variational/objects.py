@@ -25,7 +25,7 @@ class ObjectsConfig:
     Parameters
     ----------
     most : int
-        Surfaces looked for, the largest; 0 leaves the search out.
+        Surfaces looked for as templates, the largest; 0 leaves that out.
     cost : float
         A pixel is unexplained if its chosen motion costs more than this (variational.fusion), in [0, 1].
     least_px : int
@@ -78,7 +78,7 @@ def unexplained_surfaces(
     compared = np.bincount(labels[matched], minlength=len(areas))
     areas[(areas > config.largest * labels.size) | (compared < config.matched * areas)] = 0
     areas[0] = 0
-    order = np.argsort(-areas, kind="stable")[: config.most]
+    order = np.argsort(-areas, kind="stable")[:24]
     return [labels == k for k in order if areas[k] >= config.least_px]
 
 
@@ -172,7 +172,7 @@ def find_objects(
     left1, left2 : np.ndarray
         (H, W) grey in [0, 1].
     surfaces : list of np.ndarray
-        (H, W) bool masks.
+        (H, W) bool masks, the largest first.
     projection : np.ndarray
         (4, 4) of the camera.
     config : ObjectsConfig
@@ -186,7 +186,7 @@ def find_objects(
     """
     height, width = disparity.shape
     motions = []
-    for surface in surfaces:
+    for surface in surfaces[: config.most]:
         followed = follow(left1, left2, surface, config)
         if followed is None:
             continue

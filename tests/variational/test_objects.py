@@ -94,20 +94,21 @@ def test_a_lost_box_gets_its_motion() -> None:
     np.testing.assert_array_equal(motion.support, surface)
 
 
-@pytest.mark.parametrize("case", ["no surface", "nothing rigid", "nothing matched"])
+@pytest.mark.parametrize("case", ["no surface", "nothing rigid", "nothing matched", "switched off"])
 def test_nothing_is_invented(case: str) -> None:
     left1, left2, surface = jumping_box()
     random = np.random.default_rng(5).uniform(3, 60, SHAPE).astype(np.float32)
     disparity2 = random if case == "nothing rigid" else np.full(SHAPE, 12, np.float32)
     start = start_with(disparity2, np.full(SHAPE, case != "nothing matched"))
     surfaces = [] if case == "no surface" else [surface]
-    assert find_objects(start, np.full(SHAPE, 12, np.float32), left1, left2, surfaces, PROJECTION, ObjectsConfig()) == []
+    config = ObjectsConfig(most=0) if case == "switched off" else ObjectsConfig()
+    assert find_objects(start, np.full(SHAPE, 12, np.float32), left1, left2, surfaces, PROJECTION, config) == []
 
 
-def test_the_scene_is_no_object_and_only_the_largest_are_sought() -> None:
+def test_the_scene_is_no_object_and_the_largest_comes_first() -> None:
     cost = np.zeros((60, 80), np.float32)
     cost[:30] = cost[40:50, 5:35] = cost[40:50, 45:65] = 0.9
     everywhere = np.ones(cost.shape, bool)
-    disparity, config = np.full(cost.shape, 5, np.float32), ObjectsConfig(least_px=50, most=1)
+    disparity, config = np.full(cost.shape, 5, np.float32), ObjectsConfig(least_px=50)
     surfaces = unexplained_surfaces(disparity, cost, everywhere, everywhere, config)
-    assert [surface.sum() for surface in surfaces] == [300]
+    assert [surface.sum() for surface in surfaces] == [300, 200]
