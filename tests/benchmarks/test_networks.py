@@ -147,8 +147,10 @@ def machine():
 def arithmetic(case, function):
     """GFLOP of a network's convolutions and matrix products; the deep model's are counted on a 17th of the pixels."""
     size = (96, 288) if "deep" in case else SIZE
+    torch.set_num_threads(1)  # nothing runs side by side: the counter sees its own thread
     with FlopCounterMode(display=False) as counter:
         function(size)
+    torch.set_num_threads(THREADS)
     return counter.get_total_flops() / 1e9 * SIZE[0] * SIZE[1] / (size[0] * size[1])
 
 
