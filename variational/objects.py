@@ -2,7 +2,7 @@
 
 Where no candidate motion makes the images agree, although the pixels should be seen at time 2, something moved in a way
 that dense flow could not follow, mostly too far. A connected surface of such pixels is looked for in left2 as a template
-(normalised correlation under the surface's mask), dense inverse search begins anew from where it is found, and what that
+(normalised correlation under the surface's mask), and back from there; dense inverse search begins anew from where it is found, and what that
 says of the surface's points gets a rigid fit of its own. Whether the motion is any good is for the fusion to say.
 """
 
@@ -36,6 +36,9 @@ class ObjectsConfig:
         Least share of its pixels that are matched at time 1.
     jump_px : float
         A difference of disparity between neighbours that separates two surfaces.
+    return_px : float
+        A place is believed if what is seen there is found, back at time 1, at most so far along x and y from the surface: as
+        left and right are checked. A repeated pattern, or a surface that has left the image, leads elsewhere.
     reach : float
         Largest displacement along x and y, as a share of the image's width.
     template_px : int
@@ -54,6 +57,7 @@ class ObjectsConfig:
     largest: float = 0.1
     matched: float = 0.2
     jump_px: float = 1.5
+    return_px: float = 3.0
     reach: float = 0.15
     template_px: int = 32
     flow_px: int = 160
@@ -149,6 +153,10 @@ def follow(left1: np.ndarray, left2: np.ndarray, surface: np.ndarray, config: Ob
     if found is None:
         return None
     right, down = found[0] - reach, found[1] - reach
+    again = _crop(left2, top + down, left + right, height, width)
+    back = find_template(again, surface[part], _crop(left1, top - reach, left - reach, *searched.shape), config.template_px)
+    if back is None or max(abs(back[0] - reach), abs(back[1] - reach)) > config.return_px:
+        return None
     top, left, height, width = top - MARGIN, left - MARGIN, height + 2 * MARGIN, width + 2 * MARGIN
     around = _crop(left1, top, left, height, width), _crop(left2, top + down, left + right, height, width)
     flow = _flow_at_most(*around, config.flow_px)

@@ -79,6 +79,20 @@ def test_a_surface_is_followed_farther_than_dense_flow_does(corner: tuple[int, i
     assert (np.linalg.norm(moved - SHIFT, axis=1) < 0.5).mean() > 0.9
 
 
+def test_a_place_is_believed_if_the_way_back_leads_home() -> None:
+    """Left2 shows one box where left1 has two much alike: the way back from it leads to the same one only."""
+    background, box = texture(2), texture(1, (40, 50))
+    left1, left2 = background.copy(), background.copy()
+    left1[10:50, 60:110] = left2[10:50, 60:110] = box
+    left1[70:110, 60:110] = 0.6 * box + 0.4 * texture(3, (40, 50))  # gone at time 2
+    there, gone = np.zeros((2, *SHAPE), bool)
+    there[10:50, 60:110] = gone[70:110, 60:110] = True
+    config = ObjectsConfig(reach=0.35)
+    assert follow(left1, left2, there, config) is not None
+    assert follow(left1, left2, gone, config) is None
+    assert follow(left1, left2, gone, ObjectsConfig(reach=0.35, return_px=1000)) is not None
+
+
 def test_a_lost_box_gets_its_motion() -> None:
     left1, left2, surface = jumping_box()
     disparity = np.where(surface, 12, 5).astype(np.float32)
