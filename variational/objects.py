@@ -2,8 +2,9 @@
 
 Where no candidate motion makes the images agree, although the pixels should be seen at time 2, something moved in a way
 that dense flow could not follow, mostly too far. A connected surface of such pixels is looked for in left2 as a template
-(normalised correlation under the surface's mask), and back from there; dense inverse search begins anew from where it is found, and what that
-says of the surface's points gets a rigid fit of its own. Whether the motion is any good is for the fusion to say.
+(normalised correlation under the surface's mask), and back from there; dense inverse search begins anew from where it is
+found, and what that says of the surface's points gets a rigid fit of its own. Whether the motion is any good is for the
+fusion to say.
 """
 
 from dataclasses import dataclass

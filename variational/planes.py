@@ -28,7 +28,7 @@ class PlanesConfig:
     blur_px : float
         Standard deviation of the smoothing under which colours are compared.
     contrast : float
-        A region ends where a channel in [0, 1] changes by this much from one pixel to the next.
+        A region ends where a channel in [0, 1] changes by this much from one pixel to the next; in grey images by 0.58 of it.
     least_px, least_share : int, float
         Fewest unmatched pixels of a region that is worth a fit, and their least share of it.
     least_matches : int
@@ -77,7 +77,8 @@ def even_regions(image: np.ndarray, config: PlanesConfig) -> tuple[np.ndarray, n
     smooth = cv2.GaussianBlur(image.astype(np.float32, copy=False), (0, 0), config.blur_px)
     smooth = smooth.reshape(image.shape)  # OpenCV drops a single channel
     even = np.empty(image.shape[:2], np.uint8)
-    over_rows(_even, len(even), smooth, np.float32(config.contrast), even)
+    contrast = config.contrast * np.sqrt(smooth.shape[2] / 3)  # grey tells less, so it must be more even
+    over_rows(_even, len(even), smooth, np.float32(contrast), even)
     _, labels, statistics, _ = cv2.connectedComponentsWithStats(even, connectivity=4)
     return labels, statistics
 

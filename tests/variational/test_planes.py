@@ -30,12 +30,13 @@ def test_regions_end_where_the_colour_does() -> None:
     assert (labels[:, 69:71] == 0).all()
 
 
-def test_regions_equal_their_plain_twin() -> None:
-    image = np.random.default_rng(1).random((12, 17, 2), dtype=np.float32)
+@pytest.mark.parametrize(("channels", "limit"), [(3, 0.6), (1, 0.6 / 3**0.5)])
+def test_regions_equal_their_plain_twin(channels: int, limit: float) -> None:
+    image = np.random.default_rng(1).random((12, 17, channels), dtype=np.float32)
     config = PlanesConfig(blur_px=1e-3, contrast=0.6)  # as good as no smoothing
     padded = np.pad(image, ((1, 1), (1, 1), (0, 0)), mode="edge")
     steps = [abs(image - padded[j : j + 12, i : i + 17]).max(axis=2) for j, i in ((0, 1), (2, 1), (1, 0), (1, 2))]
-    even = np.max(steps, axis=0) <= 0.6
+    even = np.max(steps, axis=0) <= limit
     assert 0.05 < even.mean() < 0.95
     np.testing.assert_array_equal(even_regions(image, config)[0] > 0, even)
 
