@@ -156,6 +156,8 @@ def arithmetic(case, function):
 
 def report(names):
     """Print the table."""
+    if unknown := [name for name in names if name not in CASES]:
+        sys.exit(f"no case {unknown[0]!r}; there are {', '.join(CASES)}")
     torch.set_num_threads(THREADS)
     print(f"machine: {machine()}")
     times, disparities = {}, {}
