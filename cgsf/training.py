@@ -74,7 +74,9 @@ def train(recipe: Recipe, folder: str | Path, seconds: float = float("inf"), pro
     if len(cache) <= recipe.held_out:
         raise InputError(f"{recipe.cache}: {len(cache)} samples, of which {recipe.held_out} are held out: none to train with")
     starts = _starts(recipe.starts, cache) if recipe.stage == "refiner" or recipe.cached_networks else None
-    rivals = _starts(recipe.rivals, cache) if recipe.stage == "refiner" and recipe.refiner.rival else None
+    if bool(recipe.rivals) != (recipe.stage == "refiner" and recipe.refiner.rival):
+        raise InputError("rivals and a refiner that weighs them (rival = true, stage refiner) go together: give both or neither")
+    rivals = _starts(recipe.rivals, cache) if recipe.rivals else None
     if recipe.starts and recipe.stage == "joint" and not starts:
         raise InputError('starts take the place of networks that are frozen, as training.frozen = ["feedforward"]')
     if recipe.further and starts:

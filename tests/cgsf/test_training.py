@@ -328,6 +328,7 @@ def test_bad_input_is_one_clear_line(folder, tmp_path):
         "is no cache of starts": lambda: train(recipe(folder, "refiner", starts=str(tmp_path)), tmp_path / "other"),
         "held out": lambda: train(recipe(folder, "flow", held_out=4), tmp_path / "third"),
         "that are frozen": lambda: train(joint(folder, starts=str(folder / "starts")), tmp_path / "fourth"),
+        "go together": lambda: train(recipe(folder, "refiner", rivals=str(folder / "starts")), tmp_path / "sixth"),
         "have no starts": lambda: train(recipe(folder, "refiner", further=(str(folder / "cache"),)), tmp_path / "fifth"),
         "for ablations": lambda: export_best(recipe(folder, "refiner", energy=EnergyConfig(0)), energy_run, "x.safetensors"),
         "not of a refiner": lambda: pipelines.solve(make(0).images, "variational+refiner", config),
