@@ -72,7 +72,7 @@ class Recipe:
     """Refiner, joint: up to this many steps, drawn for each batch, are made before those that learn, so that it has seen
     its own results and does not spoil them when it is run for longer."""
     robust_px: float = 0.0
-    """Refiner, joint: errors far above this pull less; 0 is the paper's absolute error."""
+    """Errors far above this pull less (`learned.losses.robust`); 0 is the published loss of each stage."""
     augment: AugmentConfig = field(default_factory=AugmentConfig)
     training: TrainingConfig = field(default_factory=TrainingConfig)
 

@@ -102,7 +102,7 @@ class HeldOut:
 def _flow_loss(recipe: Recipe, model: nn.Module, batch: Batch) -> tuple[Tensor, dict[str, float]]:
     left1, _, left2, _ = batch.frames
     motions = cast(PWCNet, model).estimate(left1, left2)
-    return multiscale_motion_loss(motions, _truth(batch)[:, (3, 4, 2)]), {}
+    return multiscale_motion_loss(motions, _truth(batch)[:, (3, 4, 2)], recipe.robust_px), {}
 
 
 def _flow_states(recipe: Recipe, model: nn.Module, batch: Batch) -> Estimates:
@@ -118,7 +118,8 @@ def _disparity_loss(recipe: Recipe, model: nn.Module, batch: Batch) -> tuple[Ten
     second = (torch.arange(len(batch)) % 2 == 1)[:, None, None]
     left, right = torch.where(second[..., None], left2, left1), torch.where(second[..., None], right2, right1)
     estimates = cast(GANet, model).estimate(left, right)
-    return disparity_loss(estimates, torch.where(second, truth[:, 1], truth[:, 0]), recipe.ganet.max_disparity), {}
+    known = torch.where(second, truth[:, 1], truth[:, 0])
+    return disparity_loss(estimates, known, recipe.ganet.max_disparity, recipe.robust_px), {}
 
 
 def _disparity_states(recipe: Recipe, model: nn.Module, batch: Batch) -> Estimates:

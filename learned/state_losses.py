@@ -11,6 +11,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from learned.losses import robust
 from learned.oracle import Oracle
 
 
@@ -29,8 +30,7 @@ def state_loss(state: Tensor, truth: Tensor, left2_weight: float = 0.0, robust_p
     left2_weight : float
         Weight of ``|D2 - D2*|``; the paper leaves it out.
     robust_px : float
-        0: the absolute error e. Otherwise ``r log(1 + e / r)``: errors far above r pull less, so that hopeless pixels
-        do not drown those that can be mended.
+        0: the absolute error. Otherwise the `robust` one at that scale.
     """
     weights = (1.0, left2_weight, 1.0, 1.0, 1.0)
     total = state.new_zeros(())
@@ -38,9 +38,7 @@ def state_loss(state: Tensor, truth: Tensor, left2_weight: float = 0.0, robust_p
         if weight > 0:
             known = torch.isfinite(truth[:, channel])
             error = (state[:, channel] - torch.where(known, truth[:, channel], 0)).abs()
-            if robust_px > 0:
-                error = robust_px * torch.log1p(error / robust_px)
-            total = total + weight * masked_mean(error, known)
+            total = total + weight * masked_mean(robust(error, robust_px), known)
     return total
 
 

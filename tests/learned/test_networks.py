@@ -1,5 +1,6 @@
 """Configurations, sizes and gradients of GA-Net and PWC-Net; that they compute the published: test_published.py."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -112,6 +113,15 @@ def test_motion_loss_ignores_what_is_unknown():
     torch.testing.assert_close(multiscale_motion_loss(estimates, partly), loss, rtol=1e-4, atol=1e-4)
     assert multiscale_motion_loss(estimates, other) > 10 * loss
     assert multiscale_motion_loss(estimates, torch.full_like(truth, torch.nan)) < 1e-3
+
+
+def test_robust_losses_of_the_networks():
+    off = torch.tensor([3.0, 0, 4]).view(1, 3, 1, 1) / pwcnet.MOTION_UNIT_PX  # 5 px
+    weight = multiscale_motion_loss([off], torch.zeros(1, 3, 1, 1)) * pwcnet.MOTION_UNIT_PX / 5
+    robust = multiscale_motion_loss([off], torch.zeros(1, 3, 1, 1), robust_px=2)
+    torch.testing.assert_close(robust, weight * 2 * math.log(3.5) / pwcnet.MOTION_UNIT_PX)
+    estimate, truth = torch.full((1, 1, 2), 2.0), torch.tensor([[[2.0, 5.0]]])  # smooth L1: 0, 2.5
+    torch.testing.assert_close(disparity_loss([estimate], truth, 192, robust_px=2), torch.tensor(math.log(2.25)))
 
 
 def test_disparity_loss_ignores_what_is_unknown_or_out_of_range():
