@@ -51,7 +51,11 @@ class Recipe:
     held_out: int = 16
     """The cache's first samples are for validation only."""
     further: tuple[str, ...] = ()
-    """Flow, disparity: folders of further samples to train with, such as real ones with what a method says for truth."""
+    """Folders of further samples to train with, such as real ones with what a method says for truth."""
+    further_starts: tuple[str, ...] = ()
+    """Refiner: the starts of each of those folders."""
+    further_rivals: tuple[str, ...] = ()
+    """Refiner: the rivals of each of those folders."""
     further_share: float = 0.2
     """How often a sample is one of those."""
     batch: int = 4

@@ -9,8 +9,6 @@ from __future__ import annotations
 import json
 import os
 import pickle
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -19,14 +17,12 @@ import torch
 import torch.distributed as dist
 from torch import nn
 
+from cgsf.batches import Batches, Source, further_sources
 from cgsf.errors import InputError
 from cgsf.recipe import Recipe, claim
 from cgsf.sample_cache import SampleCache
 from cgsf.stages import STAGES, HeldOut
-from cgsf.start_cache import StartCache
 from cgsf.threads import bound_threads
-from learned.augment import augment
-from learned.batch import Batch
 from learned.hybrid import Hybrid
 from learned.training import TrainingError, fit
 from variational.energy import EnergyConfig
@@ -70,21 +66,18 @@ def train(recipe: Recipe, folder: str | Path, seconds: float = float("inf"), pro
         If the samples are missing, or the folder holds another recipe's run.
     """
     folder = Path(folder)
-    cache = SampleCache(recipe.cache)
-    if len(cache) <= recipe.held_out:
-        raise InputError(f"{recipe.cache}: {len(cache)} samples, of which {recipe.held_out} are held out: none to train with")
-    starts = _starts(recipe.starts, cache) if recipe.stage == "refiner" or recipe.cached_networks else None
     if bool(recipe.rivals) != (recipe.stage == "refiner" and recipe.refiner.rival):
         raise InputError("rivals and a refiner that weighs them (rival = true, stage refiner) go together: give both or neither")
-    rivals = _starts(recipe.rivals, cache) if recipe.rivals else None
-    if recipe.starts and recipe.stage == "joint" and not starts:
+    if recipe.starts and recipe.stage == "joint" and not recipe.cached_networks:
         raise InputError('starts take the place of networks that are frozen, as training.frozen = ["feedforward"]')
-    if recipe.further and starts:
-        raise InputError("further samples have no starts: they are for the stages flow and disparity")
-    batches = Batches(recipe, cache, starts, rivals, [SampleCache(folder) for folder in recipe.further])
+    if recipe.stage == "refiner" and not recipe.starts:
+        raise InputError("a refiner needs starts")
+    needs_starts = recipe.stage == "refiner" or recipe.cached_networks
+    source = Source.open(recipe.cache, recipe.starts if needs_starts else "", recipe.rivals)
+    batches = Batches(recipe, source, further_sources(recipe))
     if batches.count < 1:
-        raise InputError(f"{recipe.cache}: all of its samples are held out ({recipe.held_out}): none to train with")
-    check_truth(recipe, cache)
+        raise InputError(f"{recipe.cache}: {len(source)} samples, of which {recipe.held_out} are held out: none to train with")
+    check_truth(recipe, source.cache)
     claim(folder, recipe)
     torch.manual_seed(recipe.training.seed)
     stage = STAGES[recipe.stage]
@@ -95,61 +88,6 @@ def train(recipe: Recipe, folder: str | Path, seconds: float = float("inf"), pro
         return fit(model, batches, loss, recipe.training, folder, held_out.validate, seconds, progress, held_out.show)
     except TrainingError as error:
         raise InputError(str(error)) from error
-
-
-class Batches:
-    """``batch_at`` over a cache: every pass shuffles anew, every draw depends on the index alone."""
-
-    def __init__(
-        self, recipe: Recipe, cache: SampleCache, starts: StartCache | None = None, rivals: StartCache | None = None,
-        further: Sequence[SampleCache] = (),
-    ) -> None:  # fmt: skip
-        self.recipe, self.cache, self.starts, self.rivals = recipe, cache, starts, rivals
-        self.further = [(more, index) for more in further for index in range(len(more))]
-        self.count = min(len(source) for source in (cache, starts, rivals) if source is not None) - recipe.held_out
-
-    def __call__(self, index: int) -> Batch:
-        recipe, seed = self.recipe, self.recipe.training.seed
-        chosen = []
-        for position in range(index * recipe.batch, (index + 1) * recipe.batch):
-            draw = np.random.default_rng([seed, position, len(self.further)])
-            if self.further and draw.random() < recipe.further_share:
-                chosen.append(_images_and_truth(*self.further[draw.integers(len(self.further))]))
-            else:
-                order = np.random.default_rng([seed, position // self.count]).permutation(self.count)
-                chosen.append(self.sample(recipe.held_out + int(order[position % self.count])))
-        generator = torch.Generator().manual_seed(seed * 1_000_003 + index)
-        return Batch.cat([augment(sample, recipe.augment, generator) for sample in chosen])
-
-    def sample(self, index: int) -> Batch:
-        """One sample of the cache as a batch; its images are bytes."""
-        plain = _images_and_truth(self.cache, index)
-        if self.starts is None:
-            return plain
-        known = {name: torch.from_numpy(np.array(array)[None]) for name, array in self.starts[index].items()}
-        rival = None if self.rivals is None else torch.from_numpy(np.array(self.rivals[index]["start"])[None])
-        return replace(
-            plain, start=known["start"], backward_flow=known["backward"], evidence=known["evidence"], rival=rival,
-            homography=known["homography"],
-        )  # fmt: skip
-
-    def held_out(self) -> Iterator[Batch]:
-        """The samples that are never trained with, whole and unchanged."""
-        for index in range(self.recipe.held_out):
-            sample = self.sample(index)
-            yield replace(sample, images=sample.images.float() / 255)
-
-
-def _images_and_truth(cache: SampleCache, index: int) -> Batch:
-    images, truth = (torch.from_numpy(np.array(array)[None]) for array in cache[index])
-    return Batch(images.permute(0, 1, 4, 2, 3), truth, names=(cache.names[index],))
-
-
-def _starts(folder: str, cache: SampleCache) -> StartCache:
-    starts = StartCache(folder)
-    if starts.names != cache.names[: len(starts)]:
-        raise InputError(f"{folder} was made from other samples than those of {cache.folder}")
-    return starts
 
 
 def check_truth(recipe: Recipe, cache: SampleCache) -> None:

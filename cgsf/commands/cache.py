@@ -26,6 +26,9 @@ def command() -> None:
     "--keep", type=click.FloatRange(0, 1, min_open=True), default=0.7, show_default=True, help="Share of the surest pixels."
 )
 @click.option("--reverse", is_flag=True, help="With --truth: every sample with its two times exchanged, too.")
+@click.option(
+    "--harder", type=click.IntRange(1), metavar="N", help="Of a data set with a truth, or --truth: N harder variants each."
+)
 @click.option("--count", type=click.IntRange(1), help="Number of samples; all of a data set, 1000 rendered ones.")
 @click.option("--size", default="320x640", show_default=True, metavar="HxW", help="Height and width in pixels.")
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of the first rendered sample.")
@@ -33,21 +36,24 @@ def command() -> None:
 @workers_option
 def samples(
     output: str, families: tuple[str, ...], dataset: str | None, root: str | None, options: tuple[str, ...],
-    truth: str | None, keep: float, reverse: bool, count: int | None, size: str, seed: int, photos: Path | None, workers: int,
+    truth: str | None, keep: float, reverse: bool, harder: int | None, count: int | None, size: str, seed: int,
+    photos: Path | None, workers: int,
 ) -> None:  # fmt: skip
     """Cache samples: rendered ones (--family), or those of a data set (--dataset and --root).
 
-    A data set's larger images are cut to the size around their centre.
+    A data set's larger images are cut to the size around their centre; harder variants (pieces pasted in front, texture
+    taken away) somewhere.
     """
     from cgsf.datasets import Dataset, open_dataset
+    from cgsf.harder import Harder
     from cgsf.pseudo_truth import PseudoTruth
     from cgsf.sample_cache import write_cache
     from cgsf.synthetic import export
 
     if bool(families) == bool(dataset) or bool(dataset) != bool(root):
         raise InputError("give either --family (once or more), or --dataset and --root")
-    if (families and truth) or (reverse and not truth):
-        raise InputError("--truth is for a data set, and --reverse for --truth")
+    if (families and (truth or harder)) or (reverse and not truth):
+        raise InputError("--truth and --harder are for a data set, and --reverse for --truth")
     height, width = _size(size)
     if families:
         count = count or 1000
@@ -58,6 +64,8 @@ def samples(
         source: Dataset = open_dataset(str(dataset), str(root), **parse_options(options))
         if truth:
             source = PseudoTruth(source, truth, keep, reverse)
+        if harder:
+            source = Harder(source, harder, (height, width))
         count = min(count or len(source), len(source))
         with count_bar(count) as progress:
             write_cache(output, source.names[:count], source.__getitem__, (height, width), progress, workers)

@@ -4,6 +4,7 @@ import errno
 import os
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -12,6 +13,9 @@ from click.testing import CliRunner, Result
 import cgsf
 from cgsf.camera_motion import find_homography
 from cgsf.cli import main
+from cgsf.datasets.sample import Sample, Truth
+from cgsf.errors import InputError
+from cgsf.harder import Harder
 from cgsf.intake import to_frames
 from cgsf.sample_cache import SampleCache
 from cgsf.start_cache import StartCache
@@ -91,6 +95,53 @@ def test_what_a_method_is_surest_of_stands_for_the_truth(tmp_path: Path, frames:
     np.testing.assert_allclose(truth[known], solved.state()[known], atol=1e-5)
     assert np.abs(np.nanmedian(back[3:], (1, 2)) + scenes.FLOW).max() < 0.5
     assert np.abs(np.nanmedian(back[:3], (1, 2)) - (10, 8, -2)).max() < 0.5
+
+
+def test_harder_variants_keep_what_is_true(frames: Path, tmp_path: Path):
+    """Where the truth is known, it leads from image to image, pasted pieces included; nothing else is harder than asked."""
+    flow = np.ones((70, 100, 2), np.float32) * scenes.FLOW
+    maps = [np.full((70, 100), value, np.float32) for value in (8, 10)]
+
+    class Known:
+        names = ("one", "two")
+
+        def __len__(self) -> int:
+            return 2
+
+        def __getitem__(self, index: int) -> Sample:
+            images = [image.astype(np.float32) / 255 for image in scenes.plane(np.random.default_rng(index), 70, 100)]
+            return Sample(self.names[index], *images, truth=Truth(maps[0], maps[1], flow, disparity_left2=maps[1]))
+
+    harder = Harder(Known(), 3, (48, 64))
+    assert harder.names[3:5] == ["two-harder0", "two-harder1"]
+    looked_at = 0
+    for index in range(6):
+        sample, again = harder[index], harder[index]
+        np.testing.assert_array_equal(sample.images, again.images)
+        d1, d2, uv = sample.truth.disparity1, sample.truth.disparity2, sample.truth.flow
+        assert (d1 >= 8).all()
+        x, y = np.meshgrid(np.arange(64, dtype=np.float32), np.arange(48, dtype=np.float32))
+        places = ((x - d1, y), (x + uv[..., 0], y + uv[..., 1]), (x + uv[..., 0] - d2, y + uv[..., 1]))
+        for image, place in zip(sample.images[1:], places, strict=True):
+            there = cv2.remap(image, *(each.astype(np.float32) for each in place), cv2.INTER_LINEAR, borderValue=(np.nan,) * 3)
+            pieces = np.isfinite(there).all(-1) & (d1 > 8)
+            if pieces.sum() > 50:  # others have moved out of the image
+                looked_at += 1
+                assert np.median(np.abs(there - sample.left1)[pieces]) < 0.06
+    assert looked_at >= 6
+    with pytest.raises(InputError, match="do not fill"):
+        Harder(Known(), 1, (80, 64))[0]
+
+
+def test_harder_variants_from_the_command_line(tmp_path: Path, frames: Path):
+    arguments = ("samples", "--dataset", "frames", "--root", frames, "--size", "48x64", "--harder", 2)
+    refused = call(*arguments, "-o", tmp_path / "refused")
+    assert refused.exit_code == 2
+    assert "has no truth" in refused.stderr
+    assert call(*arguments, "-o", tmp_path / "c", "--truth", "variational", "--count", 3).exit_code == 0
+    cache = SampleCache(tmp_path / "c")
+    assert cache.names == ["scene/scene_0-harder0", "scene/scene_0-harder1", "scene/scene_1-harder0"]
+    assert np.isfinite(cache[2][1]).mean() > 0.5
 
 
 def test_starts_of_the_networks_go_on(tmp_path: Path, frames: Path, monkeypatch: pytest.MonkeyPatch):

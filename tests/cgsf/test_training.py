@@ -12,6 +12,7 @@ import torch
 
 import cgsf
 from cgsf import pipelines
+from cgsf.batches import Batches, Source, further_sources
 from cgsf.config import to_table
 from cgsf.datasets.frames import FrameFolders
 from cgsf.datasets.sample import Sample, Truth
@@ -23,7 +24,7 @@ from cgsf.sample_cache import SampleCache, write_cache
 from cgsf.stages import STAGES
 from cgsf.start_cache import StartCache, write_starts
 from cgsf.starts import StartConfig, load_start_config
-from cgsf.training import Batches, export_best, train
+from cgsf.training import export_best, train
 from learned.augment import AugmentConfig
 from learned.checkpoint import ModelCard, load, save
 from learned.pwcnet import PWCNet, PWCNetConfig
@@ -119,8 +120,8 @@ def test_a_refiner_weighs_the_networks_state(folder, tmp_path):
     networks = load_start_config("feedforward", disparity=disparity, motion=motion)
     write_starts(tmp_path / "rivals", SampleCache(folder / "cache"), networks)
     settings = recipe(folder, "refiner", rivals=str(tmp_path / "rivals"), refiner=dataclasses.replace(SMALL_REFINER, rival=True))
-    batches = Batches(settings, SampleCache(folder / "cache"), StartCache(settings.starts), StartCache(settings.rivals))
-    np.testing.assert_array_equal(batches.sample(2).rival[0], StartCache(settings.rivals)[2]["start"])
+    batches = Batches(settings, Source.open(settings.cache, settings.starts, settings.rivals))
+    np.testing.assert_array_equal(batches.source[2].rival[0], StartCache(settings.rivals)[2]["start"])
     train(settings, tmp_path / "run")
     trained = STAGES["refiner"].network(settings)
     with torch.no_grad():
@@ -201,15 +202,31 @@ def test_further_samples_are_drawn_now_and_then(folder, tmp_path):
     """At their share, of another size, never for validation; the order of the others stays."""
     further = write_cache(tmp_path / "more", ["more-0", "more-1"], make, (60, 80))
     plain = recipe(folder, "flow", starts="", further=(str(further.folder),), further_share=0.5)
-    batches = Batches(plain, SampleCache(folder / "cache"), further=[further])
+    batches = Batches(plain, Source.open(plain.cache), [Source(further)])
     names = [name for index in range(60) for name in batches(index).names]
     drawn = [name for name in names if name.startswith("more")]
     assert 40 < len(drawn) < 80
     assert set(drawn) == set(further.names)
-    alone = [name for index in range(60) for name in Batches(plain, SampleCache(folder / "cache"))(index).names]
+    alone = [name for index in range(60) for name in Batches(plain, Source.open(plain.cache))(index).names]
     assert all(a == b for a, b in zip(alone, names, strict=True) if not b.startswith("more"))
     assert batches(7).names == batches(7).names
     assert np.isfinite(train(plain, tmp_path / "run")["score"])
+
+
+def test_further_samples_of_a_refiner_bring_their_starts(folder, tmp_path):
+    """And their rivals; all of another size."""
+    further = write_cache(tmp_path / "more", NAMES[:2], make, (60, 80))
+    write_starts(tmp_path / "more-starts", further, StartConfig("opencv"))
+    folders = {"further": (str(further.folder),), "further_starts": (str(tmp_path / "more-starts"),), "further_share": 1.0}
+    rivals = {"rivals": str(folder / "starts"), "further_rivals": folders["further_starts"]}
+    weighs = dataclasses.replace(SMALL_REFINER, rival=True)
+    for settings in (recipe(folder, "refiner", **folders), recipe(folder, "refiner", refiner=weighs, **folders, **rivals)):
+        sources = further_sources(settings)
+        batch = Batches(settings, Source.open(settings.cache, settings.starts, settings.rivals), sources)(0)
+        assert batch.start.shape == (2, 5, 48, 64)
+        assert (batch.rival is not None) == bool(settings.rivals)
+        np.testing.assert_array_equal(sources[0][1].start[0], StartCache(tmp_path / "more-starts")[1]["start"])
+        assert np.isfinite(train(settings, tmp_path / f"run{settings.refiner.rival}")["score"])
 
 
 def test_supervision_without_truth(folder, tmp_path):
@@ -329,7 +346,8 @@ def test_bad_input_is_one_clear_line(folder, tmp_path):
         "held out": lambda: train(recipe(folder, "flow", held_out=4), tmp_path / "third"),
         "that are frozen": lambda: train(joint(folder, starts=str(folder / "starts")), tmp_path / "fourth"),
         "go together": lambda: train(recipe(folder, "refiner", rivals=str(folder / "starts")), tmp_path / "sixth"),
-        "have no starts": lambda: train(recipe(folder, "refiner", further=(str(folder / "cache"),)), tmp_path / "fifth"),
+        "its further_starts": lambda: train(recipe(folder, "refiner", further=(str(folder / "cache"),)), tmp_path / "fifth"),
+        "a refiner needs starts": lambda: train(recipe(folder, "refiner", starts=""), tmp_path / "seventh"),
         "for ablations": lambda: export_best(recipe(folder, "refiner", energy=EnergyConfig(0)), energy_run, "x.safetensors"),
         "not of a refiner": lambda: pipelines.solve(make(0).images, "variational+refiner", config),
         "no weights": lambda: export_best(recipe(folder, "flow"), tmp_path, tmp_path / "x.safetensors"),
@@ -354,7 +372,7 @@ def test_shipped_recipes_fit_the_shipped_networks():
 def test_steps_before_lead_to_other_starts(folder):
     """The refiner learns from what it has made of a start, not from the start alone."""
     settings = recipe(folder, "refiner", steps_before=3)
-    batch = Batches(settings, SampleCache(folder / "cache"), StartCache(folder / "starts"))(0)
+    batch = Batches(settings, Source.open(settings.cache, settings.starts))(0)
     model = STAGES["refiner"].network(settings)
     with torch.no_grad():
         model.correction.bias.fill_(0.5)
@@ -368,7 +386,7 @@ def test_steps_before_lead_to_other_starts(folder):
 
 def test_one_shuffled_pass_sees_every_sample_once(folder):
     settings = recipe(folder, "flow", held_out=1, batch=1)
-    batches = Batches(settings, SampleCache(folder / "cache"))
+    batches = Batches(settings, Source.open(settings.cache))
     first, second = ([batches(i).names[0] for i in range(start, start + 3)] for start in (0, 3))
     assert sorted(first) == sorted(second) == NAMES[1:]
     assert torch.equal(batches(2).images, batches(2).images)
