@@ -17,15 +17,17 @@ from torch import Tensor
 
 from learned.bfloat16 import to_array
 from learned.gate_kernels import gated_change as gate_kernel
+from learned.mixture_kernels import contrasts as contrasts_kernel
 from learned.mixture_kernels import mixture as mixture_kernel
 from learned.threads import over_tasks
+from learned.view_kernels import LEAST_SCALE
+from learned.view_kernels import pick as pick_kernel
 
 # Channels of the state on left1's grid that are trusted, or not, together: D1; C, u and v. D2 lives on left2's grid.
 _GROUPS = ((0,), (2, 3, 4))
-# Ratio of depths at time 2 and 1 below which a point is as good as behind the camera.
-_LEAST_SCALE = 0.05
 # What counts as good: KITTI's limit.
 _GOOD_PX = 3.0
+_CORRECTION_MOST_PX = 4.0  # a step; larger changes need somebody who vouches for them
 _DIRECTIONS = [(dy, dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1) if dy or dx]
 
 
@@ -36,6 +38,11 @@ class Grid(NamedTuple):
 
     def pick(self, maps: Tensor) -> Tensor:
         """(B, n, H, W) -> (B, n, h, w), h = ceil(H / divisor); the border's values repeat outside."""
+        if kernels_may(maps):
+            out = torch.empty((*maps.shape[:2], *(-(-side // self.divisor) for side in maps.shape[2:])))
+            arrays = maps.detach().contiguous().flatten(0, 1).numpy(), self.divisor, out.flatten(0, 1).numpy()
+            over_tasks(pick_kernel, out[..., 0].numel(), *arrays)
+            return out
         last = self.divisor - 1
         return self.pad(maps)[..., last :: self.divisor, last :: self.divisor]
 
@@ -76,9 +83,9 @@ def camera_motion(state: Tensor, coordinates: tuple[Tensor, Tensor], homography:
     x, y = coordinates
     disparity, h = state[:, 0], homography.to(state.dtype)[..., None, None]
     moved = [h[:, i, 2] * disparity + (h[:, i, 0] * x + h[:, i, 1] * y + h[:, i, 3]) for i in range(4)]
-    scale = 1 / moved[3].clamp(min=_LEAST_SCALE)
+    scale = 1 / moved[3].clamp(min=LEAST_SCALE)
     motion = torch.stack([moved[2] * scale - disparity, moved[0] * scale - x, moved[1] * scale - y], 1)
-    return torch.where(moved[3][:, None] > _LEAST_SCALE, motion, state[:, 2:])
+    return torch.where(moved[3][:, None] > LEAST_SCALE, motion, state[:, 2:])
 
 
 def second_pair(state: Tensor, coordinates: tuple[Tensor, Tensor], d2: Tensor, backward_flow: Tensor) -> tuple[Tensor, Tensor]:
@@ -133,6 +140,11 @@ class Neighbours:
 
     def contrasts(self, image: Tensor) -> Tensor:
         """(B, k, h, w): mean absolute difference of an image (B, c, h, w) to each neighbour's."""
+        if kernels_may(image):
+            out = torch.empty((image.shape[0], len(self.offsets), *image.shape[2:]))
+            arrays = self._pad(image.detach()).numpy(), np.array(self.offsets), self.reach, out.numpy()
+            over_tasks(contrasts_kernel, image.shape[0] * image.shape[2], *arrays)
+            return out
         return torch.cat([(image - other).abs().mean(1, keepdim=True) for other in self(image)], 1)
 
     def mixture(
@@ -160,10 +172,10 @@ class Neighbours:
         -------
         Tensor (B, 4, h, w)
         """
-        if _kernels_may(state):
+        if kernels_may(state):
             out = torch.empty((state.shape[0], 4, *state.shape[2:]))
-            padded = self._pad(state[:, (0, 2, 3, 4)]).numpy(), self._pad(reliability.float()).contiguous().numpy()
-            maps, weight = (to_array(preference), contrasts.numpy()), np.float32(sharpness.item())
+            padded = [self._pad(each.detach()).contiguous().numpy() for each in (state[:, (0, 2, 3, 4)], reliability.float())]
+            maps, weight = (to_array(preference.detach()), contrasts.numpy()), np.float32(sharpness.item())
             rows, offsets = state.shape[0] * state.shape[2], np.array(self.offsets)
             over_tasks(mixture_kernel, rows, *padded, *maps, weight, offsets, self.reach, out.numpy())
             return out
@@ -181,36 +193,50 @@ class Neighbours:
         return torch.cat(means, 1)
 
 
-def _kernels_may(state: Tensor) -> bool:
+def kernels_may(maps: Tensor) -> bool:
     """Whether kernels, which build no graph, may take over."""
-    return state.device.type == "cpu" and state.dtype == torch.float32 and not torch.is_grad_enabled()
+    return maps.device.type == "cpu" and maps.dtype == torch.float32 and not torch.is_grad_enabled()
 
 
-def gated_change(state: Tensor, values: Tensor, gates: Tensor, grid: Grid) -> Tensor:
-    """What gates let in of the alternatives: the change (B, 5, H, W), in pixels.
+class Alternatives(NamedTuple):
+    """What a pixel may take over, at the picked pixels."""
+
+    mixture: Tensor
+    """(B, 4, h, w): the neighbours' D1, C, u, v."""
+    camera: Tensor
+    """(B, 3, h, w): C, u, v of a point that stands still."""
+    residual: Tensor
+    """(B, 1, h, w): the second pair's, to be added to D1 or to C."""
+
+
+def gated_change(state: Tensor, alternatives: Alternatives, correction: Tensor, gates: Tensor, grid: Grid) -> Tensor:
+    """A correction, and what gates let in of the alternatives: the change (B, 5, H, W), in pixels.
 
     Without a graph to build, on a CPU, a kernel does it in one pass.
 
     Parameters
     ----------
     state : Tensor (B, 5, H, W)
-    values : Tensor (B, 13, h, w)
-        At the picked pixels: the neighbours' D1, C, u, v; the camera's C, u, v; the second pair's residual; what is added
-        in any case (5).
+    alternatives : Alternatives
+    correction : Tensor (B, 5, h, w)
+        Added in any case, but bounded.
     gates : Tensor (B, 5 divisor**2, h, w)
         For each pixel of a block, in the order of a pixel shuffle: D1 from the neighbours, D1 from the second pair, motion
-        from the neighbours, then from the camera, C from the second pair.
+        from the neighbours, then from the camera, C from the second pair. Their hyperbolic tangents count.
     grid : Grid
     """
-    if _kernels_may(state):
+    if kernels_may(state):
         change = torch.empty(state.shape)
-        arrays = state.contiguous().numpy(), values.contiguous().numpy(), gates.numpy()
-        over_tasks(gate_kernel, state.shape[0] * state.shape[2], *arrays, grid.divisor, change.numpy())
+        arrays = [each.detach().numpy() for each in (state.contiguous(), *(maps.contiguous() for maps in alternatives))]
+        arrays += [to_array(correction.detach()), to_array(gates.detach())]
+        rows = state.shape[0] * correction.shape[2]
+        over_tasks(gate_kernel, rows, *arrays, np.float32(_CORRECTION_MOST_PX), grid.divisor, change.numpy())
         return change
     size = state.shape[-2], state.shape[-1]
-    mixture, camera, residual, correction = grid.spread(values, size).split((4, 3, 1, 5), 1)
+    correction = _CORRECTION_MOST_PX * (correction.float() / _CORRECTION_MOST_PX).tanh()
+    mixture, camera, residual, correction = (grid.spread(maps, size) for maps in (*alternatives, correction))
     near, far, motion_near, motion_camera, change_far = (
-        F.pixel_shuffle(gates, grid.divisor)[..., : size[0], : size[1]].split(1, 1)
+        F.pixel_shuffle(gates.float().tanh(), grid.divisor)[..., : size[0], : size[1]].split(1, 1)
     )  # fmt: skip
     d1, motion = state[:, :1], state[:, 2:]
     mended = near * (mixture[:, :1] - d1) + far * residual
@@ -228,11 +254,11 @@ def adopted_change(change: Tensor, state: Tensor, rival: Tensor, gates: Tensor, 
     change, state, rival : Tensor (B, 5, H, W)
         The change without the rival; what it is a change of; the rival's state.
     gates : Tensor (B, 2 divisor**2, h, w)
-        Of the disparities D1 and D2, and of the motion, in the order of a pixel shuffle.
+        Of the disparities D1 and D2, and of the motion, in the order of a pixel shuffle. Their hyperbolic tangents count.
     grid : Grid
     """
     height, width = state.shape[-2:]
-    disparity, motion = F.pixel_shuffle(gates, grid.divisor)[..., :height, :width].split(1, 1)
+    disparity, motion = F.pixel_shuffle(gates.float().tanh(), grid.divisor)[..., :height, :width].split(1, 1)
     missing = rival - state - change
     return change + torch.cat([disparity * missing[:, :2], motion * missing[:, 2:]], 1)
 

@@ -12,8 +12,9 @@ from torch import Tensor, nn
 from learned.alternatives import Grid, camera_motion
 from learned.batch import Batch
 from learned.feedforward import FeedforwardModule, join_state
+from learned.inputs import View
 from learned.oracle import Oracle
-from learned.refiner import Refiner, View
+from learned.refiner import Refiner
 
 #: Called after each evaluation with the step t, the state X_t, the energy's map and gradient there (None if not
 #: needed).

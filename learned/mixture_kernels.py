@@ -1,4 +1,4 @@
-"""CPU kernel of the refiner's neighbours: weighted means of what they say, in one pass over the image."""
+"""CPU kernels of the refiner's neighbours: how they differ, and weighted means of what they say, each in one pass."""
 
 from __future__ import annotations
 
@@ -53,6 +53,40 @@ def mixture(first: int, last: int, values: np.ndarray, reliability: np.ndarray, 
                     _accumulate(logits[k], values[b, c, there, begin:], sums[c])
             for c in range(channels[0], channels[1]):
                 _divide(sums[c], total, out[b, c, y])
+
+
+@tasks
+def contrasts(first: int, last: int, image: np.ndarray, offsets: np.ndarray, reach: int, out: np.ndarray) -> None:
+    """Mean absolute difference to each neighbour.
+
+    Parameters
+    ----------
+    first, last : int
+        Rows of all B together; the last is excluded.
+    image : np.ndarray
+        (B, c, h + 2 reach, w + 2 reach) float32.
+    offsets : np.ndarray
+        (k, 2) of rows and columns, at most `reach`.
+    out : np.ndarray
+        (B, k, h, w) float32.
+    """
+    _, count, height, width = out.shape
+    channels = image.shape[1]
+    for task in range(first, last):
+        b, y = task // height, task % height
+        for k in range(count):
+            there, begin = y + reach + offsets[k, 0], reach + offsets[k, 1]
+            out[b, k, y] = 0
+            for c in range(channels):
+                _add_difference(image[b, c, y + reach, reach:], image[b, c, there, begin:], out[b, k, y])
+            for x in range(width):
+                out[b, k, y, x] *= np.float32(1 / channels)
+
+
+@lanes
+def _add_difference(a: np.ndarray, b: np.ndarray, total: np.ndarray) -> None:
+    for x in range(total.size):
+        total[x] += abs(a[x] - b[x])
 
 
 @lanes

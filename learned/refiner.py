@@ -9,28 +9,21 @@ vouches for (`learned.alternatives`).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, get_args
+from typing import NamedTuple, get_args
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from learned.alternatives import Grid, Neighbours, adopted_change, camera_motion, gated_change, second_pair
+from learned.alternatives import Alternatives, Grid, Neighbours, adopted_change, gated_change
 from learned.batch import Batch
+from learned.inputs import Input, View, look
 
-Input = Literal["state", "loss", "gradient", "deviation", "image", "evidence"]
-
-# What brings each input to a range of about one. Pixels of motion, the energy's map (its photometric terms end at 3),
-# the gradient (the coupling's is 1 a pixel).
-_STATE_SCALE, _LOSS_SCALE, _GRADIENT_SCALE = 0.05, 0.5, 1.0
-_LOSS_MOST, _GRADIENT_MOST = 20.0, 5.0
-_SURROUNDINGS_PX = 16  # side of the box that the deviation is measured against
 # Affinity of neighbours falls by this factor's exponential with their difference in intensity, before training.
 _EDGE_SHARPNESS = 10.0
 # Gates: D1 from its neighbours and from the second pair, motion from its neighbours and the camera's, C from the second
 # pair; then both disparities and motion from the rival.
 _GATES, _RIVAL_GATES = 5, 2
-_CORRECTION_MOST_PX = 4.0  # a step; larger changes need somebody who vouches for them
 
 
 @dataclass(frozen=True)
@@ -69,11 +62,21 @@ class RefinerConfig:
             raise ValueError("divisor and distances must be at least 1, steps not negative, and there must be a hidden layer")
 
     @property
+    def layout(self) -> dict[str, int]:
+        """Input channels by name, in order; with neighbours, all that tells whom to trust is among them."""
+        counts = {"state": 5, "loss": 1, "gradient": 5, "deviation": 5, "image": 6, "evidence": self.evidence}
+        layout: dict[str, int] = {name: counts[name] for name in self.inputs}
+        if self.neighbours:
+            layout |= {"camera": 3, "residual": 1, "round trip": 1}
+            layout |= {"camera loss": 1} if self.weighs_energies else {}
+            layout |= {"rival": 5, "rival losses": 2} if self.rival else {}
+            layout["within"] = 2 * (self.divisor**2 - 1)
+        return layout
+
+    @property
     def channels(self) -> int:
         """Input channels."""
-        count = {"state": 5, "loss": 1, "gradient": 5, "deviation": 5, "image": 6, "evidence": self.evidence}
-        beside = 2 * (self.divisor**2 - 1) + 5 + self.weighs_energies + 7 * self.rival if self.neighbours else 0
-        return sum(count[name] for name in self.inputs) + beside
+        return sum(self.layout.values())
 
     @property
     def needs_energy(self) -> bool:
@@ -95,23 +98,6 @@ COMPACT = RefinerConfig(
     neighbours=(2, 8),
     detached=True,
 )
-
-
-class View(NamedTuple):
-    """What G looks at, beside the batch."""
-
-    state: Tensor
-    """(B, 5, H, W), pixels."""
-    loss: Tensor | None = None
-    """(B, H, W): the energy's map."""
-    gradient: Tensor | None = None
-    """(B, 5, H, W): of the energy."""
-    camera_loss: Tensor | None = None
-    """(B, H, W): the energy's map if everything followed the camera's motion."""
-    rival_losses: Tensor | None = None
-    """(B, 2, H, W): the energy's map with the rival's disparities, and with its motion."""
-    contrasts: Tensor | None = None
-    """(B, k, h, w): of left1, between neighbours."""
 
 
 class Update(NamedTuple):
@@ -167,93 +153,24 @@ class Refiner(nn.Module):
             Its images if they are an input, its evidence if that is one; with neighbours its backward flow and the camera's
             motion (without it, the state's own).
         """
-        state = view.state
-        size = state.shape[-2], state.shape[-1]
-        picked = self.grid.pick(state)
-        features = [self._input(name, view, picked, batch) for name in self.config.inputs]
+        state, seen = view.state, look(self.config, self.grid, view, batch)
+        x = self.hidden(seen.inputs)
+        correction = self.correction(x)
         if not self.config.neighbours:
-            correction = self.correction(self.hidden(_planar(torch.cat(features, 1)))).float()
-            return Update(self.grid.spread(correction, size), None)
-        camera, residual, beside = self._alternatives(view, picked, batch)
-        features += [_signed_log(maps) for maps in beside]
-        x = self.hidden(_planar(torch.cat(features, 1)))
-        correction, reliability, gates = (head(x).float() for head in (self.correction, self.reliability, self.gates))
-        preference = self.preference(x)
-        correction = _CORRECTION_MOST_PX * (correction / _CORRECTION_MOST_PX).tanh()
+            return Update(self.grid.spread(correction.float(), (state.shape[-2], state.shape[-1])), None)
+        reliability, preference, gates = self._heads(x)
+        reliability = reliability.float()
         assert view.contrasts is not None
-        mixture = self.neighbours.mixture(picked, preference, view.contrasts, self.edge_sharpness, reliability)
-        values = torch.cat([mixture, camera, residual, correction], 1)
-        own = _GATES * self.config.divisor**2
-        gates, rival_gates = gates.tanh().tensor_split((own,), 1)
-        change = gated_change(state, values, gates, self.grid)
+        mixture = self.neighbours.mixture(seen.picked, preference, view.contrasts, self.edge_sharpness, reliability)
+        gates, rival_gates = gates.tensor_split((_GATES * self.config.divisor**2,), 1)
+        change = gated_change(state, Alternatives(mixture, seen.camera, seen.residual), correction, gates, self.grid)
         if self.config.rival:
             assert batch.rival is not None
             change = adopted_change(change, state, batch.rival, rival_gates, self.grid)
         return Update(change, reliability)
 
-    def _alternatives(self, view: View, picked: Tensor, batch: Batch) -> tuple[Tensor, Tensor, list[Tensor]]:
-        """The camera's motion (B, 3, h, w), the second pair's residual (B, 1, h, w), and all that tells whom to trust."""
-        state, coordinates = view.state, self.grid.coordinates(picked)
-        backward_flow = -state[:, 3:] if batch.backward_flow is None else batch.backward_flow
-        residual, round_trip = second_pair(picked, coordinates, state[:, 1:2], backward_flow)
-        camera = picked[:, 2:]
-        if batch.homography is not None:
-            camera = camera_motion(picked, coordinates, batch.homography)
-        beside = [camera - picked[:, 2:], residual, round_trip]
-        if self.config.weighs_energies:
-            assert view.camera_loss is not None
-            assert view.loss is not None
-            beside.append(self._mean((view.camera_loss - view.loss)[:, None]))
-        if self.config.rival:
-            assert batch.rival is not None
-            assert view.rival_losses is not None
-            assert view.loss is not None
-            beside += [self.grid.pick(batch.rival) - picked, self._mean(view.rival_losses - view.loss[:, None])]
-        return camera, residual, beside + [self._within(state[:, channel : channel + 1]) for channel in (0, 3)]
-
-    def _input(self, name: Input, view: View, picked: Tensor, batch: Batch) -> Tensor:
-        """An input (B, n, h, w), scaled."""
-        match name:
-            case "state":
-                return _STATE_SCALE * picked
-            case "deviation":
-                return _signed_log(_deviation(picked, max(_SURROUNDINGS_PX // self.config.divisor, 1)))
-            case "loss" if view.loss is not None:
-                return _LOSS_SCALE * self._mean(view.loss[:, None].clamp(max=_LOSS_MOST))
-            case "gradient" if view.gradient is not None:
-                return _GRADIENT_SCALE * self._mean(view.gradient.clamp(-_GRADIENT_MOST, _GRADIENT_MOST))
-            case "image":
-                return self.grid.pick(batch.images[:, (0, 2)].flatten(1, 2)) - 0.5
-            case "evidence" if batch.evidence is not None:
-                return self.grid.pick(batch.evidence) - 0.5
-        raise ValueError(f"this refiner needs the input {name!r}")
-
-    def _mean(self, maps: Tensor) -> Tensor:
-        """Mean over each block."""
-        divisor, padded = self.config.divisor, self.grid.pad(maps)
-        corners = [padded[..., i::divisor, j::divisor] for i in range(divisor) for j in range(divisor)]
-        return sum(corners[1:], corners[0]) / divisor**2  # a quarter of a pooling's time
-
-    def _within(self, maps: Tensor) -> Tensor:
-        """How the other pixels of a block differ from the one that stands for it."""
-        block = F.pixel_unshuffle(self.grid.pad(maps), self.config.divisor)
-        return block[:, :-1] - block[:, -1:]
-
-
-def _deviation(state: Tensor, side: int) -> Tensor:
-    # of boxes, interpolated: a sliding mean costs as much as the convolutions
-    boxes = F.avg_pool2d(state, side, ceil_mode=True, count_include_pad=False)
-    return state - F.interpolate(boxes, state.shape[-2:], mode="bilinear", align_corners=False)
-
-
-def _signed_log(maps: Tensor) -> Tensor:
-    """From a tenth of a pixel to a hundred in a range of about one: asinh(2 x) / 2, which torch has in slow loops only."""
-    size = 2 * maps.abs()
-    return 0.5 * torch.copysign((size + (size * size + 1).sqrt()).log(), maps)
-
-
-def _planar(maps: Tensor) -> Tensor:
-    """As convolutions want them: channels innermost, half of a convolution's time, and in autocast's type, all at once."""
-    device = maps.device.type
-    dtype = torch.get_autocast_dtype(device) if torch.is_autocast_enabled(device) else maps.dtype
-    return maps.to(dtype, memory_format=torch.channels_last)
+    def _heads(self, x: Tensor) -> tuple[Tensor, ...]:
+        """Reliability, preference and gates, by one convolution."""
+        heads = self.reliability, self.preference, self.gates
+        weight, bias = torch.cat([head.weight for head in heads]), torch.cat([head.bias for head in heads])  # type: ignore[misc]
+        return F.conv2d(x, weight, bias).split([head.out_channels for head in heads], 1)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from learned.elementary import exponential, hyperbolic_tangent
+from learned.elementary import exponential, hyperbolic_tangent, logarithm
 from learned.jit import tasks
 
 
@@ -33,3 +33,19 @@ def test_what_lies_beyond_float32_stays_finite_and_nan_stays_nan():
     np.testing.assert_array_equal(tangents[:4], [-1, -1, 1, 1])
     assert np.isnan(powers[4])
     assert np.isnan(tangents[4])
+
+
+@tasks
+def _logarithms(first, last, x, out):
+    for i in range(first, last):
+        out[i] = logarithm(x[i])
+
+
+def test_logarithm_is_numpys_and_nan_stays_nan():
+    x = np.concatenate([np.logspace(-37, 38, 10_001), np.linspace(0.5, 2, 10_001)]).astype(np.float32)
+    out = np.empty_like(x)
+    _logarithms(0, x.size, x, out)
+    np.testing.assert_allclose(out, np.log(x.astype(np.float64)), rtol=3e-7, atol=2e-7)
+    out = np.empty(2, np.float32)
+    _logarithms(0, 2, np.array([np.nan, np.inf], np.float32), out)
+    assert np.isnan(out).all()

@@ -5,11 +5,13 @@ import dataclasses
 import pytest
 import torch
 
-from learned.alternatives import Grid, Neighbours, adopted_change, camera_motion, gated_change, reliability_loss, second_pair
+from learned import alternatives
+from learned.alternatives import Alternatives, Grid, Neighbours, camera_motion, gated_change, second_pair
 from learned.batch import Batch
 from learned.hybrid import Hybrid, refine
+from learned.inputs import View, look
 from learned.oracle import Oracle
-from learned.refiner import COMPACT, Refiner, RefinerConfig, View
+from learned.refiner import COMPACT, Refiner, RefinerConfig
 
 SMALL = dataclasses.replace(COMPACT, layers=((8, 1), (8, 2)), neighbours=(1, 3), steps=3)
 SMALL_RIVAL = dataclasses.replace(SMALL, rival=True)
@@ -84,9 +86,11 @@ def test_every_pixel_of_a_block_gets_its_change():
     assert difference[0, : HEIGHT - 7].max() == 0
 
 
-def test_grid_picks_the_last_pixel_of_each_block():
+@pytest.mark.parametrize("kernel", [False, True])
+def test_grid_picks_the_last_pixel_of_each_block(kernel: bool):
     maps, grid = torch.arange(5 * 7.0).reshape(1, 1, 5, 7), Grid(2)
-    picked = grid.pick(maps)
+    with torch.set_grad_enabled(not kernel):
+        picked = grid.pick(maps)
     columns, rows = grid.coordinates(picked)
     assert torch.equal(columns, torch.tensor([1.0, 3, 5, 7]))
     assert torch.equal(rows[:, 0], torch.tensor([1.0, 3, 5]))
@@ -167,35 +171,51 @@ def test_second_pair_is_looked_up_where_the_flow_leads_to():
     assert round_trip[0, 0, 1, 2] == pytest.approx(((3 - 8 / 7) ** 2 + (-1 + 2 / 5) ** 2) ** 0.5, abs=1e-5)
 
 
+def _alternatives(mixture: list[float], camera: list[float], residual: float) -> Alternatives:
+    return Alternatives(*(torch.tensor(values)[None, :, None, None] for values in (mixture, camera, [residual])))
+
+
+OPEN = 20.0  # its hyperbolic tangent is one
+
+
 @pytest.mark.parametrize(("gate", "expected"), [(0, [7, 0, 0, 0]), (1, [20, 0, 0, 0]), (2, [0, 1, 2, 3]), (3, [0, 4, 5, 6]),
                                                 (4, [0, 20, 0, 0])])  # fmt: skip
 def test_each_gate_lets_in_one_alternative(gate: int, expected: list[float]):
-    values = torch.tensor([7.0, 1, 2, 3, 4, 5, 6, 20, 0, 0, 0, 0, 0])[None, :, None, None]
+    offers = _alternatives([7.0, 1, 2, 3], [4.0, 5, 6], 20.0)
     gates = torch.zeros(1, 5, 1, 1)
-    gates[:, gate] = 1
-    change = gated_change(torch.zeros(1, 5, 1, 1), values, gates, Grid(1))[0, :, 0, 0]
+    gates[:, gate] = OPEN
+    nothing = torch.zeros(1, 5, 1, 1)
+    change = gated_change(nothing, offers, nothing, gates, Grid(1))[0, :, 0, 0]
     assert change[1] == 0
     assert torch.equal(change[[0, 2, 3, 4]], torch.tensor(expected, dtype=torch.float32))
 
 
 def test_both_motions_at_once_do_not_add_up():
     """Neighbours and camera agree on a value: a pixel that trusts both gets it once."""
-    values = torch.tensor([0.0, 5, 5, 5, 5, 5, 5, 0, 0, 0, 0, 0, 0])[None, :, None, None]
-    gates = torch.tensor([0.0, 0, 1, 1, 0])[None, :, None, None]
-    change = gated_change(torch.zeros(1, 5, 1, 1), values, gates, Grid(1))
+    offers, nothing = _alternatives([0.0, 5, 5, 5], [5.0, 5, 5], 0.0), torch.zeros(1, 5, 1, 1)
+    gates = OPEN * torch.tensor([0.0, 0, 1, 1, 0])[None, :, None, None]
+    change = gated_change(nothing, offers, nothing, gates, Grid(1))
     assert torch.equal(change[0, 2:, 0, 0], torch.full((3,), 5.0))
 
 
-@pytest.mark.parametrize(("divisor", "size"), [(1, (5, 7)), (2, (5, 7)), (3, (8, 10))])
-def test_the_gates_kernel_does_what_is_written_plainly(divisor: int, size: tuple[int, int]):
+def test_corrections_have_a_bound():
+    correction, closed = torch.tensor([[0.01, -0.01, 1e4, -1e4, 0]])[..., None, None], torch.zeros(1, 5, 1, 1)
+    change = gated_change(closed, _alternatives([0.0] * 4, [0.0] * 3, 0.0), correction, closed, Grid(1))[0, :, 0, 0]
+    torch.testing.assert_close(change, torch.tensor([0.01, -0.01, 4, -4, 0]))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+@pytest.mark.parametrize(("divisor", "size"), [(1, (5, 7)), (2, (5, 7)), (2, (6, 9)), (3, (8, 10))])
+def test_the_gates_kernel_does_what_is_written_plainly(divisor: int, size: tuple[int, int], dtype: torch.dtype):
     generator = torch.Generator().manual_seed(divisor)
     blocks = [-(-side // divisor) for side in size]
     state = 10 * torch.randn(2, 5, *size, generator=generator)
-    values = 10 * torch.randn(2, 13, *blocks, generator=generator)
-    gates = torch.randn(2, 5 * divisor**2, *blocks, generator=generator).tanh()
-    plain = gated_change(state, values, gates, Grid(divisor))
+    offers = Alternatives(*(10 * torch.randn(2, n, *blocks, generator=generator) for n in (4, 3, 1)))
+    correction, gates = (torch.randn(2, n, *blocks, generator=generator).to(dtype, memory_format=torch.channels_last)
+                         for n in (5, 5 * divisor**2))
+    plain = gated_change(state, offers, correction, gates, Grid(divisor))
     with torch.no_grad():
-        assert torch.allclose(gated_change(state, values, gates, Grid(divisor)), plain, atol=1e-4)
+        assert torch.allclose(gated_change(state, offers, correction, gates, Grid(divisor)), plain, atol=1e-4)
 
 
 def test_a_rivals_values_come_in_pixel_by_pixel():
@@ -204,12 +224,45 @@ def test_a_rivals_values_come_in_pixel_by_pixel():
     change, state, rival = torch.randn(3, 1, 5, 5, 7, generator=generator)
     for group, channels in enumerate(([0, 1], [2, 3, 4])):
         gates = torch.zeros(1, 8, 3, 4)
-        gates[:, 4 * group + 1] = 1  # the upper right pixel of each block
-        result = state + adopted_change(change, state, rival, gates, Grid(2))
+        gates[:, 4 * group + 1] = OPEN  # the upper right pixel of each block
+        result = state + alternatives.adopted_change(change, state, rival, gates, Grid(2))
         expected = state + change
         for channel in channels:
             expected[0, channel, ::2, 1::2] = rival[0, channel, ::2, 1::2]
         assert torch.allclose(result, expected, atol=1e-6)
+
+
+KINDS = [SMALL, SMALL_RIVAL, dataclasses.replace(SMALL, inputs=("state",)), dataclasses.replace(SMALL, divisor=1),
+         dataclasses.replace(SMALL, inputs=("gradient", "evidence", "deviation", "loss"), evidence=3, divisor=3)]  # fmt: skip
+
+
+@pytest.mark.parametrize("config", KINDS)
+def test_the_inputs_kernel_does_what_is_written_plainly(batch: Batch, config: RefinerConfig):
+    generator = torch.Generator().manual_seed(2)
+    homography = torch.eye(4, dtype=torch.float64) + 0.01 * torch.randn(2, 4, 4, generator=generator)
+    evidence, rival = (torch.rand(2, n, HEIGHT, WIDTH, generator=generator) for n in (3, 5))
+    batch = dataclasses.replace(batch, homography=homography, evidence=evidence, rival=rival)
+    loss, camera_loss = 30 * torch.rand(2, 2, HEIGHT, WIDTH, generator=generator)
+    gradient, rival_losses = (8 * torch.randn(2, n, HEIGHT, WIDTH, generator=generator) for n in (5, 2))
+    view = View(batch.start, loss, gradient, camera_loss, rival_losses)
+    plain = look(config, Grid(config.divisor), view, batch)
+    with torch.no_grad():
+        seen = look(config, Grid(config.divisor), view, batch)
+        with torch.autocast("cpu", torch.bfloat16):
+            rounded = look(config, Grid(config.divisor), view, batch).inputs
+    assert plain.inputs.shape[1] == config.channels
+    for one, other in zip(seen, plain, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-4)
+    assert rounded.dtype == torch.bfloat16
+    assert rounded.is_contiguous(memory_format=torch.channels_last)
+    torch.testing.assert_close(rounded.float(), plain.inputs, rtol=0.01, atol=1e-3)
+
+
+def test_the_contrasts_kernel_does_what_is_written_plainly():
+    image = torch.rand(2, 3, 9, 13, generator=torch.Generator().manual_seed(6))
+    plain = Neighbours((1, 3)).contrasts(image)
+    with torch.no_grad():
+        torch.testing.assert_close(Neighbours((1, 3)).contrasts(image), plain)
 
 
 def test_a_rival_is_weighed_by_its_energies(batch: Batch):
@@ -253,9 +306,9 @@ def test_reliability_loss_ignores_unknown_truth():
     truth, logits = torch.randn(1, 5, 6, 6, generator=generator), torch.full((1, 2, 6, 6), 30.0)
     truth[0, :, :2] = torch.nan
     state = torch.where(truth.isnan(), 100.0, truth)
-    assert reliability_loss(logits, state, truth) < 1e-6
-    assert reliability_loss(-logits, state, truth) > 20
-    assert reliability_loss(logits, state, torch.full_like(truth, torch.nan)) == 0
+    assert alternatives.reliability_loss(logits, state, truth) < 1e-6
+    assert alternatives.reliability_loss(-logits, state, truth) > 20
+    assert alternatives.reliability_loss(logits, state, torch.full_like(truth, torch.nan)) == 0
 
 
 def test_detached_steps_learn_from_their_own_loss_alone(batch: Batch):
