@@ -2,9 +2,10 @@
 
 Candidates are whole motion fields, measured flow or rigid proposals. A candidate's cost at a pixel is how badly the
 census words of left1 agree with those of left2 and right2 where it leads, averaged over a small window; one that leads
-out of the image costs a constant. Neighbours pay for a difference of motion, less across jumps of disparity and edges
-of the image. The labelling minimises this along a tree at every pixel (rows first, then the column through it: the
-"simple tree" of Bleyer and Gelautz 2008), which dynamic programming does exactly in four sweeps.
+out of the image costs a constant. Measured flow was fitted to the images pixel by pixel; a rigid motion was not, so it
+may lead one pixel beside. Neighbours pay for a difference of motion, less across jumps of disparity and edges of the
+image. The labelling minimises this along a tree at every pixel (rows first, then the column through it: the "simple tree"
+of Bleyer and Gelautz 2008), which dynamic programming does exactly in four sweeps.
 """
 
 from dataclasses import dataclass
@@ -33,6 +34,9 @@ class FusionConfig:
         Share of differing census bits from which a comparison says no more than "different".
     outside_cost : float
         Cost in [0, 1] of leading out of the image.
+    good_cost : float
+        A rigid motion that costs more at a pixel is compared with the pixels around the place where it leads, too; the
+        best counts.
     window : int
         Side of the window that costs are averaged over, pixels, odd.
     motion_scale_px : float
@@ -47,6 +51,7 @@ class FusionConfig:
 
     truncation: float = 0.4
     outside_cost: float = 0.4
+    good_cost: float = 0.2
     window: int = 7
     motion_scale_px: float = 10.0
     jump_cost: float = 3.0
@@ -59,7 +64,8 @@ class FusionConfig:
 @rowwise
 def _costs(
     first: int, last: int, candidates: np.ndarray, disparity: np.ndarray, words_left1: np.ndarray,
-    words_left2: np.ndarray, words_right2: np.ndarray, largest: float, outside: float, costs: np.ndarray,
+    words_left2: np.ndarray, words_right2: np.ndarray, largest: float, outside: float, good: float,
+    costs: np.ndarray,
 ) -> None:  # fmt: skip
     count, _, height, width = candidates.shape
     for y in range(first, last):
@@ -73,15 +79,23 @@ def _costs(
                 if to_x < 0 or to_x >= width or to_y < 0 or to_y >= height:
                     costs[k, y, x] = outside
                     continue
-                bits = popcount(words_left1[0, y, x] ^ words_left2[0, to_y, to_x])
-                bits += popcount(words_left1[1, y, x] ^ words_left2[1, to_y, to_x])
-                cost = min(bits / largest, 1.0)
-                in_right = int(np.rint(x + u - disparity[y, x] - candidates[k, 0, y, x]))
-                if 0 <= in_right < width:
-                    bits = popcount(words_left1[0, y, x] ^ words_right2[0, to_y, in_right])
-                    bits += popcount(words_left1[1, y, x] ^ words_right2[1, to_y, in_right])
-                    cost = 0.5 * (cost + min(bits / largest, 1.0))
-                costs[k, y, x] = cost
+                right_x = int(np.rint(x + u - disparity[y, x] - candidates[k, 0, y, x])) - to_x
+                least = np.float32(1.0)
+                for beside in range(1 if k == 0 else 9):  # the place itself first
+                    at_x, at_y = to_x + (beside + 1) % 3 - 1, to_y + (beside // 3 + 1) % 3 - 1
+                    if least <= good:
+                        break
+                    if at_x < 0 or at_x >= width or at_y < 0 or at_y >= height:
+                        continue
+                    bits = popcount(words_left1[0, y, x] ^ words_left2[0, at_y, at_x])
+                    bits += popcount(words_left1[1, y, x] ^ words_left2[1, at_y, at_x])
+                    cost = min(bits / largest, 1.0)
+                    if 0 <= at_x + right_x < width:
+                        bits = popcount(words_left1[0, y, x] ^ words_right2[0, at_y, at_x + right_x])
+                        bits += popcount(words_left1[1, y, x] ^ words_right2[1, at_y, at_x + right_x])
+                        cost = 0.5 * (cost + min(bits / largest, 1.0))
+                    least = min(least, cost)
+                costs[k, y, x] = least
 
 
 @inlined
@@ -223,7 +237,7 @@ def motion_costs(
     Parameters
     ----------
     candidates : np.ndarray
-        (K, 3, H, W) float32: disparity change, u, v; NaN where a candidate does not exist.
+        (K, 3, H, W) float32: disparity change, u, v; NaN where a candidate does not exist. The measured motion first.
     disparity : np.ndarray
         (H, W) at time 1.
     words : tuple of three np.ndarray
@@ -235,8 +249,8 @@ def motion_costs(
         (K, H, W) float32; FORBIDDEN where a candidate does not exist.
     """
     costs = np.empty((len(candidates), *disparity.shape), np.float32)
-    largest, outside = np.float32(config.truncation * BITS), np.float32(config.outside_cost)
-    over_rows(_costs, len(disparity), candidates, disparity, *words, largest, outside, costs)
+    largest, outside, good = (np.float32(n) for n in (config.truncation * BITS, config.outside_cost, config.good_cost))
+    over_rows(_costs, len(disparity), candidates, disparity, *words, largest, outside, good, costs)
 
     def average(first: int, last: int) -> None:
         for k in range(first, last):

@@ -76,6 +76,23 @@ def test_the_true_motion_is_chosen_and_outside_costs_a_constant() -> None:
     assert (labels[8:-8, 8:-10] == 0).mean() > 0.99
 
 
+def test_a_rigid_motion_may_lead_one_pixel_beside() -> None:
+    """All the eight ways round, in both images of time 2; two pixels are too far, and the measured motion may not."""
+    left1 = np.random.default_rng(3).random((41, 63), np.float32)
+    left2 = np.roll(left1, (2, 5), (0, 1))
+    words = (census(left1), census(left2), census(np.roll(left2, -3, 1)))
+    disparity = np.full((41, 63), 4, np.float32)
+    offsets = [(0, 0)] + [(x, y) for x in (-1, 0, 1) for y in (-1, 0, 1)] + [(2, 0), (0, -2)]
+    candidates = np.empty((len(offsets), 3, 41, 63), np.float32)
+    for k, (x, y) in enumerate(offsets):
+        candidates[k] = np.reshape((-1, 5 + x, 2 + y), (3, 1, 1))
+    costs = motion_costs(candidates, disparity, words, FusionConfig())[:, 12:-12, 12:-12].max((1, 2))
+    assert costs[:-2].max() < 0.05
+    assert costs[-2:].min() > 0.5
+    candidates[0, 1] += 1
+    assert motion_costs(candidates, disparity, words, FusionConfig())[0, 12:-12, 12:-12].min() > 0.5
+
+
 @pytest.mark.parametrize(("margin", "height", "spread_px"), [(0.5, 29, 3), (1.5, 29, 3), (1.0, 100, 3), (1.0, 100, 40)])
 def test_projection_equals_its_plain_twin(margin: float, height: int, spread_px: float) -> None:
     rng = np.random.default_rng(4)
