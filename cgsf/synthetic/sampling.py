@@ -37,23 +37,19 @@ def pack(textures: Sequence[Texture]) -> tuple[np.ndarray, np.ndarray]:
 @rowwise
 def _choose(
     count: int, textures: np.ndarray, texture: np.ndarray, texels: np.ndarray, taps: np.ndarray, several: bool,
-    copy: np.ndarray, mix: np.ndarray,
+    copy: np.ndarray, mix: np.ndarray, samples: np.ndarray,
 ) -> None:  # fmt: skip
     """The copy that has one to two texels under the pixel, or the next; `mix` > 0 is the share of the next."""
     for i in range(count):
-        x, last = texels[i], textures[texture[i]].last
-        level = np.int32(0)
-        scale = 1.0
-        for k in range(1, _COPIES):
-            finer = (x >= 2.0**k) & (k <= last)
-            level += finer
-            scale = scale * 0.5 if finer else scale
-        beyond = x * scale - 1.0
+        x, last = np.float64(texels[i]), textures[texture[i]].last
+        level = min(max((x.view(np.int64) >> 52) - 1023, 0), last)  # the logarithm's whole part: a double's exponent
+        beyond = x * np.int64((1023 - level) << 52).view(np.float64) - 1.0
         mixed = several & (taps[i] == 1)
         stays = (level == last) | (beyond < (0.2 if mixed else 0.5))
         moves = (not stays) & ((beyond > 0.8) | (not mixed))
         copy[i] = level + moves
         mix[i] = 0.0 if (stays | moves) else beyond
+        samples[i] = taps[i] if (stays | moves) else 2
 
 
 @rowwise
@@ -64,41 +60,45 @@ def _first(
 ) -> None:  # fmt: skip
     """The first sample of every lookup."""
     for i in range(count):
-        t, n = texture[i], max(taps[i], 1)
+        t, n = texture[i], taps[i]
         along = 0.5 / n - 0.5
         at_u[i], at_v[i] = u[i] + along * step_u[i], v[i] + along * step_v[i]
         start[i] = textures[t].start[copy[i]]
         size[i] = textures[t].size >> copy[i]
         mirror[i] = textures[t].mirrored
-        weight[i] = (1.0 - mix[i]) / (255.0 * 4096.0 * n) if taps[i] > 0 else 0.0
+        weight[i] = (1.0 - mix[i]) / (255.0 * 4096.0 * n)
 
 
 @rowwise
-def _others(
-    count: int, textures: np.ndarray, texture: np.ndarray, u: np.ndarray, v: np.ndarray, step_u: np.ndarray,
-    step_v: np.ndarray, taps: np.ndarray, copy: np.ndarray, mix: np.ndarray, at_u: np.ndarray, at_v: np.ndarray,
-    start: np.ndarray, size: np.ndarray, mirror: np.ndarray, weight: np.ndarray, owner: np.ndarray,
-) -> int:  # fmt: skip
-    """The second and third samples of those lookups that have them; returns how many.
-
-    Two are written always, and those that are too many are overwritten: cheaper than a branch.
-    """
+def _list(count: int, samples: np.ndarray, sample: int, owner: np.ndarray) -> int:
+    """The lookups that take more samples than `sample`; returns how many. One too many is written: cheaper than a branch."""
     place = 0
     for i in range(count):
-        n, share = taps[i], mix[i]
-        mixed = share > 0.0
-        width = 0.0 if mixed else 1.0 / max(n, 1)
-        along = 0.0 if mixed else 1.5 * width - 0.5
-        t, own = texture[i], copy[i] + mixed
-        begin, side, mirrored = textures[t].start[own], textures[t].size >> own, textures[t].mirrored
-        portion = (share if mixed else width) / (255.0 * 4096.0)
-        for k in range(2):
-            at_u[place + k], at_v[place + k] = u[i] + along * step_u[i], v[i] + along * step_v[i]
-            start[place + k], size[place + k], mirror[place + k] = begin, side, mirrored
-            weight[place + k], owner[place + k] = portion, i
-            along += width
-        place += max(n - 1, 0) + mixed
+        owner[place] = i
+        place += samples[i] > sample
     return place
+
+
+@rowwise
+def _other(
+    count: int, owner: np.ndarray, third: bool, textures: np.ndarray, texture: np.ndarray, u: np.ndarray, v: np.ndarray,
+    step_u: np.ndarray, step_v: np.ndarray, taps: np.ndarray, copy: np.ndarray, mix: np.ndarray, at_u: np.ndarray,
+    at_v: np.ndarray, start: np.ndarray, size: np.ndarray, mirror: np.ndarray, weight: np.ndarray,
+) -> None:  # fmt: skip
+    """The second or third sample of some lookups."""
+    for k in range(count):
+        i = owner[k]
+        share = mix[i]
+        mixed = share > 0.0
+        width = 0.0 if mixed else 1.0 / taps[i]
+        along = 0.0 if mixed else 1.5 * width - 0.5
+        along += width if third else 0.0
+        t, own = texture[i], copy[i] + mixed
+        at_u[k], at_v[k] = u[i] + along * step_u[i], v[i] + along * step_v[i]
+        start[k] = textures[t].start[own]
+        size[k] = textures[t].size >> own
+        mirror[k] = textures[t].mirrored
+        weight[k] = (share if mixed else width) / (255.0 * 4096.0)
 
 
 @rowwise
@@ -173,26 +173,29 @@ def look_up(
     step_u, step_v : ndarray (n,) float64
         Extent of the pixel along its longer side, over which the taps are spread.
     taps : ndarray (n,) int32
-        Samples along that side, at most `MOST_SAMPLES`; 0 leaves the value 0.
+        Samples along that side, 1 to `MOST_SAMPLES`.
     texels : ndarray (n,) float64
         Texels of the largest copy under a tap: they choose the copy.
     several : bool
         Take all taps, and where there is one, mix two copies linearly in the texels: close to a logarithm's mix and
-        much cheaper. Otherwise `taps` is at most 1 and the value is that of the nearer copy.
+        much cheaper. Otherwise `taps` is 1 and the value is that of the nearer copy.
     color : ndarray (3, n) float64, written
         BGR in [0, 1].
-    space, whole : ndarray (7, 2 n + 2) float64, (5, 2 n + 2) int32
+    space, whole : ndarray (7, n + 1) float64, (6, n + 1) int32
         Scratch.
     """
-    copy, start, size, mirror, owner = whole[0], whole[1], whole[2], whole[3], whole[4]
+    copy, start, size, mirror, owner, samples = whole[0], whole[1], whole[2], whole[3], whole[4], whole[5]
     mix, at_u, at_v, weight, blue, green, red = space[0], space[1], space[2], space[3], space[4], space[5], space[6]
-    _choose(count, textures, texture, texels, taps, several, copy, mix)
+    _choose(count, textures, texture, texels, taps, several, copy, mix, samples)
     _first(count, textures, texture, u, v, step_u, step_v, taps, copy, mix, at_u, at_v, start, size, mirror, weight)
     _bilinear(count, atlas, start, size, mirror, at_u, at_v, blue, green, red)
     _weigh(count, weight, blue, green, red, color)
     if several:
-        others = _others(
-            count, textures, texture, u, v, step_u, step_v, taps, copy, mix, at_u, at_v, start, size, mirror, weight, owner
-        )
-        _bilinear(others, atlas, start, size, mirror, at_u, at_v, blue, green, red)
-        _add(others, owner, weight, blue, green, red, color)
+        for sample in range(1, MOST_SAMPLES):
+            others = _list(count, samples, sample, owner)
+            _other(
+                others, owner, sample == 2, textures, texture, u, v, step_u, step_v, taps, copy, mix, at_u, at_v, start, size,
+                mirror, weight,
+            )  # fmt: skip
+            _bilinear(others, atlas, start, size, mirror, at_u, at_v, blue, green, red)
+            _add(others, owner, weight, blue, green, red, color)

@@ -106,15 +106,30 @@ def _footprint(
 @rowwise
 def _fine(
     count: int, material: np.ndarray, materials: np.ndarray, fine_texels: np.ndarray, u: np.ndarray, v: np.ndarray,
-    texture: np.ndarray, at_u: np.ndarray, at_v: np.ndarray, taps: np.ndarray, amplitude: np.ndarray,
-) -> None:  # fmt: skip
-    """Lookups of the fine textures that are multiplied in; far away they are below the pixel and fade."""
+    owner: np.ndarray, amplitude: np.ndarray, texture: np.ndarray, at_u: np.ndarray, at_v: np.ndarray, taps: np.ndarray,
+    texels: np.ndarray,
+) -> int:  # fmt: skip
+    """Lookups of the fine textures that are multiplied in, of the rays `owner`; far away they are below the pixel and fade."""
+    place = 0
     for i in range(count):
+        owner[place] = i
+        amplitude[place] = max(min(1.0, 2.0 - fine_texels[i] / 64.0), 0.0) * materials[material[i]].detail_strength
+        place += amplitude[place] > 0.0
+    for k in range(place):
+        i = owner[k]
         m = material[i]
-        texture[i] = materials[m].detail
-        at_u[i], at_v[i] = u[i] * materials[m].detail_scale, v[i] * materials[m].detail_scale
-        amplitude[i] = max(min(1.0, 2.0 - fine_texels[i] / 64.0), 0.0) * materials[m].detail_strength
-        taps[i] = amplitude[i] > 0.0
+        texture[k], taps[k], texels[k] = materials[m].detail, 1, fine_texels[i]
+        at_u[k], at_v[k] = u[i] * materials[m].detail_scale, v[i] * materials[m].detail_scale
+    return place
+
+
+@rowwise
+def _grain(count: int, lookups: int, owner: np.ndarray, amplitude: np.ndarray, fine: np.ndarray, grain: np.ndarray) -> None:
+    """Factors of the rays: those of their fine textures, 1 for rays without."""
+    for i in range(count):
+        grain[i] = 1.0
+    for k in range(lookups):
+        grain[owner[k]] = max(1.0 + amplitude[k] * (2.0 * fine[1, k] - 1.0), 0.0)
 
 
 @rowwise
@@ -173,38 +188,43 @@ def _shadow(
     size = depth.shape[0]
     middle = 0.5 * (size - 1)
     for i in range(count):
-        u, v = x[i] + middle, y[i] + middle
-        if cosine[i] <= 0.0:
-            lit[i] = 0.0
-        elif z[i] + bias > 0.0 and u >= 0.0 and v >= 0.0 and u < size - 1 and v < size - 1:
-            row, column, limit = int(v), int(u), z[i]
-            a, b = u - column, v - row
-            top = (1.0 - a) * (depth[row, column] > limit) + a * (depth[row, column + 1] > limit)
-            bottom = (1.0 - a) * (depth[row + 1, column] > limit) + a * (depth[row + 1, column + 1] > limit)
-            lit[i] *= (1.0 - b) * top + b * bottom
+        u, v, limit = x[i] + middle, y[i] + middle, z[i]
+        inside = (limit + bias > 0.0) & (u >= 0.0) & (v >= 0.0) & (u < size - 1) & (v < size - 1)
+        column, row = np.uint32(u if inside else 0.0), np.uint32(v if inside else 0.0)
+        a, b = u - column, v - row
+        top = (1.0 - a) * (depth[row, column] > limit) + a * (depth[row, np.uint32(column + 1)] > limit)
+        row = np.uint32(row + 1)
+        bottom = (1.0 - a) * (depth[row, column] > limit) + a * (depth[row, np.uint32(column + 1)] > limit)
+        reached = lit[i] * ((1.0 - b) * top + b * bottom) if inside else lit[i]
+        lit[i] = 0.0 if cosine[i] <= 0.0 else reached
 
 
 @rowwise
 def _color(
-    count: int, material: np.ndarray, materials: np.ndarray, illumination: np.ndarray, texture: np.ndarray, fine: np.ndarray,
-    amplitude: np.ndarray, ny: np.ndarray, cosine: np.ndarray, half: np.ndarray, lit: np.ndarray, color: np.ndarray,
+    count: int, material: np.ndarray, materials: np.ndarray, illumination: np.ndarray, texture: np.ndarray,
+    grains: np.ndarray, ny: np.ndarray, cosine: np.ndarray, half: np.ndarray, lit: np.ndarray, owner: np.ndarray,
+    highlight: np.ndarray, color: np.ndarray,
 ) -> None:  # fmt: skip
     """Radiance of the surfaces themselves."""
     light = illumination[0]
     gloss = light.gloss
+    shiny = 0
     for i in range(count):
         m = material[i]
-        shine = materials[m].specular * gloss
-        fall = materials[m].shininess * (1.0 - half[i])
-        half[i] = 0.0
-        if shine > 0.0 and lit[i] > 0.0 and fall < 7.0:  # a Gaussian on the sphere, close to half ** shininess
-            half[i] = shine * lit[i] * math.exp(-fall)
+        owner[shiny] = i
+        shiny += (materials[m].specular * gloss > 0.0) & (lit[i] > 0.0) & (materials[m].shininess * (1.0 - half[i]) < 7.0)
+    for i in range(count):
+        highlight[i] = 0.0
+    for k in range(shiny):  # a Gaussian on the sphere, close to half ** shininess
+        i = owner[k]
+        m = material[i]
+        highlight[i] = materials[m].specular * gloss * lit[i] * math.exp(-(materials[m].shininess * (1.0 - half[i])))
     sun_b, sun_g, sun_r = light.color[0], light.color[1], light.color[2]
     above_b, above_g, above_r = light.above[0], light.above[1], light.above[2]
     below_b, below_g, below_r = light.below[0], light.below[1], light.below[2]
     for i in range(count):
         m = material[i]
-        grain = max(1.0 + amplitude[i] * (2.0 * fine[1, i] - 1.0), 0.0)
+        grain = grains[i]
         b, g, r = texture[0, i], texture[1, i], texture[2, i]
         mix = materials[m].color
         blue = mix[0, 0] * b + mix[0, 1] * g + mix[0, 2] * r + mix[0, 3]
@@ -213,9 +233,9 @@ def _color(
         blue, green = min(max(blue, 0.0), 1.0) * grain, min(max(green, 0.0), 1.0) * grain
         red = min(max(red, 0.0), 1.0) * grain
         up, direct, glow = 0.5 - 0.5 * ny[i], lit[i] * max(cosine[i], 0.0), 2.0 * materials[m].glow
-        color[0, i] = blue * blue * (up * above_b + (1.0 - up) * below_b + sun_b * direct + glow) + half[i] * sun_b
-        color[1, i] = green * green * (up * above_g + (1.0 - up) * below_g + sun_g * direct + glow) + half[i] * sun_g
-        color[2, i] = red * red * (up * above_r + (1.0 - up) * below_r + sun_r * direct + glow) + half[i] * sun_r
+        color[0, i] = blue * blue * (up * above_b + (1.0 - up) * below_b + sun_b * direct + glow) + highlight[i] * sun_b
+        color[1, i] = green * green * (up * above_g + (1.0 - up) * below_g + sun_g * direct + glow) + highlight[i] * sun_g
+        color[2, i] = red * red * (up * above_r + (1.0 - up) * below_r + sun_r * direct + glow) + highlight[i] * sun_r
 
 
 @rowwise
@@ -227,7 +247,7 @@ def _sky_lookups(
     for i in range(count):
         up = max(-dy[i], 0.0)
         reach = 0.25 / (0.12 + up)
-        texture[i], taps[i] = cloud, dy[i] <= 0.0
+        texture[i], taps[i] = cloud, 1
         at_u[i], at_v[i] = dx[i] * reach, dz[i] * reach
         texels[i] = 2.0 + 6.0 * (1.0 - min(1.0, 1.4 * math.sqrt(up)))
 
@@ -279,8 +299,8 @@ def shade(
     """
     light = illumination[0]
     bias, haze, cloud = light.shadow_bias_m, light.haze_per_m, textures.size - 1
-    number, whole = np.zeros((27, _CHUNK)), np.zeros((6, _CHUNK), np.int32)
-    space, whole_space = np.zeros((7, 2 * _CHUNK + 2)), np.zeros((5, 2 * _CHUNK + 2), np.int32)
+    number, whole = np.zeros((28, _CHUNK + 1)), np.zeros((7, _CHUNK + 1), np.int32)
+    space, whole_space = np.zeros((7, _CHUNK + 1)), np.zeros((6, _CHUNK + 1), np.int32)
     texture, fine, color, radiance = np.zeros((3, _CHUNK)), np.zeros((3, _CHUNK)), np.zeros((3, _CHUNK)), np.zeros((3, _CHUNK))
     x, y, depth, u, v, nx, ny, nz = (
         number[0], number[1], number[2], number[3], number[4], number[5], number[6], number[7]
@@ -292,7 +312,7 @@ def shade(
         number[16], number[17], number[18], number[19], number[20], number[21], number[22], number[23], number[24], number[25]
     )  # fmt: skip
     triangle, material, which, taps, place, mirrors = whole[0], whole[1], whole[2], whole[3], whole[4], whole[5]
-    amplitude = number[26]
+    amplitude, grains, owner = number[26], number[27], whole[6]
     mixed, nearest = np.bool_(True), np.bool_(False)  # of texture lookups
 
     for first in range(0, rays, _CHUNK):
@@ -309,13 +329,14 @@ def shade(
             met, material, materials, textures, u, v, ux, uy, vx, vy, which, at_u, at_v, step_u, step_v, taps, texels, fine_texels
         )
         look_up(met, textures, atlas, which, at_u, at_v, step_u, step_v, taps, texels, mixed, texture, space, whole_space)
-        _fine(met, material, materials, fine_texels, u, v, which, at_u, at_v, taps, amplitude)
-        look_up(met, textures, atlas, which, at_u, at_v, step_u, step_v, taps, fine_texels, nearest, fine, space, whole_space)
+        lookups = _fine(met, material, materials, fine_texels, u, v, owner, amplitude, which, at_u, at_v, taps, texels)
+        look_up(lookups, textures, atlas, which, at_u, at_v, step_u, step_v, taps, texels, nearest, fine, space, whole_space)
+        _grain(met, lookups, owner, amplitude, fine, grains)
         _light(
             met, x, y, depth, sight, illumination, nx, ny, nz, dx, dy, dz, distance, facing, cosine, half, lit, ux, uy, vx
         )
         _shadow(met, depth_map, bias, cosine, ux, uy, vx, lit)
-        _color(met, material, materials, illumination, texture, fine, amplitude, ny, cosine, half, lit, color)
+        _color(met, material, materials, illumination, texture, grains, ny, cosine, half, lit, owner, amplitude, color)
 
         mirrored = np.int64(0)
         for i in range(met):
