@@ -17,6 +17,7 @@ from torch import Tensor
 
 from learned.bfloat16 import to_array
 from learned.gate_kernels import gated_change as gate_kernel
+from learned.mixture_kernels import border as border_kernel
 from learned.mixture_kernels import contrasts as contrasts_kernel
 from learned.mixture_kernels import mixture as mixture_kernel
 from learned.threads import over_tasks
@@ -174,10 +175,12 @@ class Neighbours:
         """
         if kernels_may(state):
             out = torch.empty((state.shape[0], 4, *state.shape[2:]))
-            padded = [self._pad(each.detach()).contiguous().numpy() for each in (state[:, (0, 2, 3, 4)], reliability.float())]
+            count, _, height, width = state.shape
+            bordered = np.empty((count, 6, height + 2 * self.reach, width + 2 * self.reach), np.float32)
+            arrays = state.detach().contiguous().numpy(), to_array(reliability.detach())
+            over_tasks(border_kernel, count * bordered.shape[2], *arrays, self.reach, bordered)
             maps, weight = (to_array(preference.detach()), contrasts.numpy()), np.float32(sharpness.item())
-            rows, offsets = state.shape[0] * state.shape[2], np.array(self.offsets)
-            over_tasks(mixture_kernel, rows, *padded, *maps, weight, offsets, self.reach, out.numpy())
+            over_tasks(mixture_kernel, count * height, bordered, *maps, weight, np.array(self.offsets), self.reach, out.numpy())
             return out
         preference = preference.float() - sharpness * contrasts
         reliability = reliability.float()

@@ -10,18 +10,34 @@ from learned.jit import lanes, tasks
 
 
 @tasks
-def mixture(first: int, last: int, values: np.ndarray, reliability: np.ndarray, preference: np.ndarray, contrasts: np.ndarray,
-            sharpness: float, offsets: np.ndarray, reach: int, out: np.ndarray) -> None:
+def border(first: int, last: int, state: np.ndarray, reliability: np.ndarray, reach: int, out: np.ndarray) -> None:
+    """D1, C, u, v of (B, 5, h, w) and a reliability (B, 2, h, w), float32 or uint16, to (B, 6, h + 2 reach, w + 2 reach).
+
+    The border's values repeat outside. Tasks: rows of `out`, of all B together.
+    """
+    height, width = state.shape[2:]
+    for task in range(first, last):
+        b, y = task // out.shape[2], task % out.shape[2]
+        there = min(max(y - reach, 0), height - 1)
+        for c in range(6):
+            row = out[b, c, y]
+            for x in range(width):
+                row[reach + x] = state[b, c + min(c, 1), there, x] if c < 4 else widen(reliability[b, c - 4, there, x])
+            row[:reach] = row[reach]
+            row[reach + width :] = row[reach + width - 1]
+
+
+@tasks
+def mixture(first: int, last: int, bordered: np.ndarray, preference: np.ndarray, contrasts: np.ndarray, sharpness: float,
+            offsets: np.ndarray, reach: int, out: np.ndarray) -> None:
     """``sum_k w_k(p) X(p + o_k)``, ``w = softmax_k(a_k(p) - sharpness * contrast_k(p) + r(p + o_k))``.
 
     Parameters
     ----------
     first, last : int
         Rows of all B together; the last is excluded.
-    values : np.ndarray
-        (B, 4, h + 2 reach, w + 2 reach) float32: X = D1, C, u, v.
-    reliability : np.ndarray
-        (B, 2, h + 2 reach, w + 2 reach) float32: r, of D1 and of the motion.
+    bordered : np.ndarray
+        (B, 6, h + 2 reach, w + 2 reach) float32, by :func:`border`: X = D1, C, u, v; r of D1 and of the motion.
     preference, contrasts : np.ndarray
         (B, k, h, w), the first float32 or uint16: a, with whatever strides.
     sharpness : float
@@ -43,14 +59,14 @@ def mixture(first: int, last: int, values: np.ndarray, reliability: np.ndarray, 
             most[:] = -np.inf
             for k in range(count):
                 there, begin = y + reach + offsets[k, 0], reach + offsets[k, 1]
-                _add_and_compare(own[k], reliability[b, group, there, begin:], logits[k], most)
+                _add_and_compare(own[k], bordered[b, 4 + group, there, begin:], logits[k], most)
             total[:] = 0
             sums[:] = 0
             for k in range(count):
                 there, begin = y + reach + offsets[k, 0], reach + offsets[k, 1]
                 _weigh(logits[k], most, total)
                 for c in range(channels[0], channels[1]):
-                    _accumulate(logits[k], values[b, c, there, begin:], sums[c])
+                    _accumulate(logits[k], bordered[b, c, there, begin:], sums[c])
             for c in range(channels[0], channels[1]):
                 _divide(sums[c], total, out[b, c, y])
 

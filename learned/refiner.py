@@ -159,7 +159,6 @@ class Refiner(nn.Module):
         if not self.config.neighbours:
             return Update(self.grid.spread(correction.float(), (state.shape[-2], state.shape[-1])), None)
         reliability, preference, gates = self._heads(x)
-        reliability = reliability.float()
         assert view.contrasts is not None
         mixture = self.neighbours.mixture(seen.picked, preference, view.contrasts, self.edge_sharpness, reliability)
         gates, rival_gates = gates.tensor_split((_GATES * self.config.divisor**2,), 1)
@@ -167,7 +166,7 @@ class Refiner(nn.Module):
         if self.config.rival:
             assert batch.rival is not None
             change = adopted_change(change, state, batch.rival, rival_gates, self.grid)
-        return Update(change, reliability)
+        return Update(change, reliability.float())
 
     def _heads(self, x: Tensor) -> tuple[Tensor, ...]:
         """Reliability, preference and gates, by one convolution."""
