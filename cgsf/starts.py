@@ -12,7 +12,7 @@ from cgsf.baselines import CompositionConfig, compose
 from cgsf.camera_motion import find_homography
 from cgsf.config import to_table
 from cgsf.errors import InputError
-from cgsf.feedforward import FeedforwardConfig, run_networks, to_colour, weights_path
+from cgsf.feedforward import FeedforwardConfig, run_networks, weights_path
 from cgsf.formats.files import read_bytes
 from cgsf.scene_flow import SceneFlow
 from variational.camera import StereoCamera
@@ -81,12 +81,13 @@ def to_batch(frames: Frames, start: SceneFlow, camera: StereoCamera | None = Non
 
     from learned.batch import Batch
 
-    # channels stay innermost in memory: the energy, which wants them there, need not copy them back
-    images = np.stack([to_colour(image) for image in (frames.left1, frames.right1, frames.left2, frames.right2)])
+    # channels stay innermost in memory: the energy, which wants them there, need not copy them back; grey is repeated without
+    # a copy, and the energy computes it once
+    images = torch.from_numpy(np.stack([frames.left1, frames.right1, frames.left2, frames.right2]))
     maps = start_maps(start)
     homography = torch.from_numpy(find_homography(maps[0], maps[1].transpose(1, 2, 0), camera))[None]
     state, backward, evidence = (torch.from_numpy(np.ascontiguousarray(each))[None] for each in maps)
-    return Batch(torch.from_numpy(images).permute(0, 3, 1, 2)[None], None, state, backward, evidence, homography=homography)
+    return Batch(images.permute(0, 3, 1, 2).expand(-1, 3, -1, -1)[None], None, state, backward, evidence, homography=homography)
 
 
 def describe(config: StartConfig) -> dict[str, Any]:

@@ -101,6 +101,8 @@ class _AnalyticEnergy(torch.autograd.Function):
 
 
 def _channels_last(images: Tensor) -> np.ndarray:
-    """``(B, c, H, W)`` tensor to ``(B, H, W, c)`` array, contiguous, float32 or float64."""
+    """``(B, c, H, W)`` tensor to ``(B, H, W, c)`` array, contiguous, float32 or float64; channels that share their memory,
+    as those of a grey image made to look like colour, become one: the energy takes their mean."""
+    images = images[:, :1] if images.stride(1) == 0 else images
     kept = images if images.dtype in (torch.float32, torch.float64) else images.float()
     return np.ascontiguousarray(kept.permute(0, 2, 3, 1).numpy())

@@ -194,9 +194,9 @@ class Energy:
         """What does not depend on the state, prepared once for each type."""
         if dtype not in self._prepared:
             frames, sharpness = self.frames, self.config.edge_sharpness
-            edges1, edges2, left1, right1, left2, right2 = side_by_side(
-                *(partial(edge_weights, image, sharpness, dtype) for image in (frames.left1, frames.left2)),
-                *(partial(padded_planes, image, dtype) for image in (frames.left1, frames.right1, frames.left2, frames.right2)))
+            left1, right1, left2, right2 = side_by_side(*(
+                partial(padded_planes, image, dtype) for image in (frames.left1, frames.right1, frames.left2, frames.right2)))
+            edges1, edges2 = edge_weights(left1, sharpness), edge_weights(left2, sharpness)
             channels = left1.shape[0]
             backward = np.zeros((2, 1), dtype) if self.backward_flow is None else flow_planes(self.backward_flow, dtype)
             self._prepared[dtype] = (

@@ -94,3 +94,13 @@ def test_another_device_goes_to_the_twin():
     assert loss.shape == (2, 18, 25)
     assert gradient.shape == state.shape
     assert gradient.device.type == oracle.energy(state).device.type == "meta"
+
+
+def test_grey_images_repeated_without_a_copy_are_computed_once():
+    state, left1, right1, left2, right2, backward = batch(dtype=torch.float32)
+    grey = [image[:, :1] for image in (left1, right1, left2, right2)]
+    repeated = Oracle(*(image.expand(-1, 3, -1, -1) for image in grey), backward)
+    assert {energy.frames.left1.shape[2] for energy in repeated._energies} == {1}
+    copied = Oracle(*(image.repeat(1, 3, 1, 1) for image in grey), backward)
+    for one, other in zip(repeated.features(state), copied.features(state), strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-4)

@@ -11,18 +11,33 @@ Reference: Godard et al. 2017 (doi:10.1109/CVPR.2017.699).
 
 import numpy as np
 
-from variational.jit import rowwise
+from variational.jit import over_rows, rowwise
 from variational.penalties import penalty
 
 
-def edge_weights(image: np.ndarray, sharpness: float, dtype: np.dtype | type) -> np.ndarray:
-    """``(2, H, W)``: the weights of d_x and d_y, zero in the last column (row), of an ``(H, W, c)`` image."""
-    planes = np.ascontiguousarray(image.transpose(2, 0, 1), dtype)  # numpy is slow along an axis as short as the channels
-    weights = np.zeros((2, *image.shape[:2]), dtype)
-    for axis, of_axis in ((2, weights[0, :, :-1]), (1, weights[1, :-1])):
-        steps = np.diff(planes, axis=axis)
-        np.exp(-sharpness * np.abs(steps, out=steps).mean(axis=0), out=of_axis)
+def edge_weights(planes: np.ndarray, sharpness: float) -> np.ndarray:
+    """``(2, H, W)``: the weights of d_x and d_y, zero in the last column (row), of planes by `photometric.padded_planes`."""
+    height, width = planes.shape[1] - 2, planes.shape[2] - 2
+    weights = np.empty((2, height, width), planes.dtype)
+    over_rows(contrast_band, height, planes, -float(sharpness), weights)
+    np.exp(weights, out=weights)
+    weights[0, :, -1] = weights[1, -1] = 0
     return weights
+
+
+@rowwise
+def contrast_band(first: int, last: int, planes: np.ndarray, factor: float, out: np.ndarray) -> None:
+    """`factor` times the mean absolute forward differences along x and y of rows `first` to `last` (excluded)."""
+    channels, kind = planes.shape[0], planes.dtype.type
+    factor = kind(factor / channels)
+    for y in range(first, last):
+        for x in range(out.shape[2]):
+            along, down = kind(0), kind(0)
+            for c in range(channels):
+                own = planes[c, y + 1, x + 1]
+                along += abs(planes[c, y + 1, x + 2] - own)
+                down += abs(planes[c, y + 2, x + 1] - own)
+            out[0, y, x], out[1, y, x] = factor * along, factor * down
 
 
 @rowwise
