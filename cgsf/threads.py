@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import os
+from functools import cache
 
 import cv2
 import numba
@@ -37,11 +38,12 @@ def bound_threads(count: int, networks: bool = True) -> None:
         torch.set_num_threads(count)
 
 
+@cache
 def keep_freed_memory() -> None:
-    """Let the C library keep what is freed, up to 1 GiB, for the next layer of a network.
+    """Let the C library keep what is freed, up to 1 GiB, for the next layer of a network or the next rendered scene.
 
     Otherwise it gives large arrays back at once, and the system hands out the same pages anew, zeroed one by one: a
-    twentieth of the hybrid's time. A C library that is not glibc is left as it is.
+    twentieth of the hybrid's time, a tenth of a scene's. A C library that is not glibc is left as it is.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if os.name == "posix" else None
     if mallopt is not None:

@@ -22,7 +22,9 @@ def recolored(rng: np.random.Generator) -> np.ndarray:
 def tinted(bgr: np.ndarray, texture_share: float = 0.3) -> np.ndarray:
     """The colour change (3, 4) that turns any texture into `bgr` (3,) with a grey trace of the texture."""
     bgr = np.asarray(bgr, float)
-    return np.concatenate([np.repeat(bgr[:, None] * 2 * texture_share / 3, 3, 1), bgr[:, None] * (1 - texture_share)], 1)
+    matrix = np.empty((3, 4))
+    matrix.T[:3], matrix.T[3] = bgr * 2 * texture_share / 3, bgr * (1 - texture_share)
+    return matrix
 
 
 def finish(rng: np.random.Generator) -> dict[str, float]:

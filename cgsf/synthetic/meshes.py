@@ -6,6 +6,7 @@ its own normal (smooth or flat) and texture coordinates. Metres, x right, y **do
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -37,9 +38,16 @@ class Mesh:
     surface: np.ndarray
     closed: bool = False
 
+    @cached_property
+    def surfaces(self) -> int:
+        """Number of smooth surfaces."""
+        return int(self.surface.max()) + 1
+
     def moved(self, translation: ArrayLike = (0, 0, 0), rotation: Rotation | None = None) -> "Mesh":
         """The mesh rotated about its origin, then shifted by `translation` metres."""
-        turn = np.eye(3) if rotation is None else rotation.as_matrix()
+        if rotation is None:
+            return replace(self, points=self.points + np.asarray(translation, float))
+        turn = rotation.as_matrix()
         return replace(self, points=self.points @ turn.T + np.asarray(translation, float), normals=self.normals @ turn.T)
 
     def scaled(self, scale: ArrayLike) -> "Mesh":
@@ -52,7 +60,7 @@ class Mesh:
 
 def join(meshes: Sequence[Mesh]) -> Mesh:
     """One mesh of several; the surfaces stay apart. It counts as closed only if all parts are."""
-    offsets = np.cumsum([0, *(int(mesh.surface.max()) + 1 for mesh in meshes)])
+    offsets = np.cumsum([0, *(mesh.surfaces for mesh in meshes)])
     return Mesh(
         np.concatenate([mesh.points for mesh in meshes]),
         np.concatenate([mesh.normals for mesh in meshes]),
@@ -166,12 +174,13 @@ _CUBE_FAR = np.tile(np.array([(0, 0), (1, 0), (1, 1), (0, 1)], float)[_HALVES], 
 
 def boxes(sizes: ArrayLike, middles: ArrayLike = ((0, 0, 0),)) -> Mesh:
     """Boxes of `sizes` (K, 3) or (3,) m about `middles` (K, 3) m; the texture stands upright on their four sides."""
-    sizes, middles = np.broadcast_arrays(np.atleast_2d(np.asarray(sizes, float)), np.asarray(middles, float))
-    points = _CUBE_TRIANGLES * (sizes / 2)[:, None, None] + middles[:, None, None]
-    uv = sizes[:, _CUBE_AXES] * _CUBE_FAR
-    count = len(sizes)
-    normals = np.broadcast_to(_CUBE_NORMALS, (count, 12, 3, 3)).reshape(-1, 3, 3)
-    return Mesh(points.reshape(-1, 3, 3), normals, uv.reshape(-1, 3, 2), np.repeat(np.arange(6 * count), 2), True)
+    sizes, middles = np.asarray(sizes, float).reshape(-1, 3), np.asarray(middles, float)
+    points = (_CUBE_TRIANGLES * (sizes / 2)[:, None, None] + middles[:, None, None]).reshape(-1, 3, 3)
+    count = len(points) // 12
+    uv = (sizes[:, _CUBE_AXES] * _CUBE_FAR).reshape(-1, 3, 2)
+    uv = uv if len(uv) == len(points) else np.tile(uv, (count, 1, 1))
+    normals = _CUBE_NORMALS if count == 1 else np.tile(_CUBE_NORMALS, (count, 1, 1))
+    return Mesh(points, normals, uv, np.arange(12 * count) // 2, True)
 
 
 def box(size: ArrayLike) -> Mesh:
@@ -183,9 +192,12 @@ def hull(points: np.ndarray) -> Mesh:
     """The convex hull of `points` (K, 3) m, flat faces."""
     shape = ConvexHull(points)
     middle = points[shape.vertices].mean(0)
-    _, first, surface = np.unique(np.round(shape.equations, 6), axis=0, return_index=True, return_inverse=True)
-    order = np.argsort(surface.ravel(), kind="stable")
-    surface = surface.ravel()[order]
+    planes = [tuple(plane) for plane in np.round(shape.equations, 6).tolist()]
+    number = {plane: index for index, plane in enumerate(sorted(set(planes)))}
+    first = [planes.index(plane) for plane in number]
+    surface = np.array([number[plane] for plane in planes])
+    order = np.argsort(surface, kind="stable")
+    surface = surface[order]
     triangles, normal = points[shape.simplices[order]], shape.equations[first, :3][surface]
     along = points[shape.simplices[first, 1]] - points[shape.simplices[first, 0]]
     along = (along / np.linalg.norm(along, axis=1, keepdims=True))[surface]

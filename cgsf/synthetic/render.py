@@ -18,6 +18,7 @@ from cgsf.synthetic.sensor import Sensor
 from cgsf.synthetic.shading import ILLUMINATION, Surfaces, shade
 from cgsf.synthetic.textures import TextureSource
 from cgsf.synthetic.truth import View, follow, seen
+from cgsf.threads import keep_freed_memory
 
 _QUARTERS = np.array([[-0.125, -0.375], [0.375, -0.125], [0.125, 0.375], [-0.375, 0.125]])
 
@@ -85,23 +86,27 @@ class Renderer:
         clouds["mirrored"] = True
         self.textures = np.concatenate([records, clouds])
         self.offsets = _QUARTERS if config.antialias else _QUARTERS[:0]
+        self.points, self.normals = np.empty_like(self.soup.points), np.empty_like(self.soup.normals)
+        self.soup.at(0.0, np.arange(len(self.points)), self.points, self.normals)
+        self.moving = self.soup.moving
+        self.illumination, self.still = self._illumination()
 
     def stereo(self, time: float) -> tuple[View, View, np.ndarray, np.ndarray]:
         """Left and right view at `time` with their radiance, (H, W, 3) float32 each."""
-        points, normals = self.soup.at(self.scene, time)
-        illumination, depth_map = self._illumination(points)
-        soup = self.soup
-        surfaces = Surfaces(normals, soup.uv, soup.material, soup.materials, self.textures, self.atlas)
+        soup, points = self.soup, self.points
+        soup.at(time, self.moving, points, self.normals)
+        depth_map = self._shadows()
+        surfaces = Surfaces(self.normals, soup.uv, soup.material, soup.materials, self.textures, self.atlas)
         pose = self.scene.path.pose(time)
         views, radiances = [], []
         for shift in (0.0, self.scene.camera.baseline_m):
             pose = pose.copy()
             pose[0, 3] -= shift
-            caster = Caster(points, pose, self.soup.culled, self.intrinsics, self.height, self.width)
+            caster = Caster(points, pose, soup.culled, self.intrinsics, self.height, self.width)
             inverse_depth, hit = caster.centres()
             rays = picture_rays(caster, inverse_depth, hit, soup.surface, self.offsets)
             radiance = np.zeros((self.height, self.width, 3), np.float32)
-            shade(*surfaces, illumination, depth_map, caster.plane, caster.sight(), *rays, radiance)
+            shade(*surfaces, self.illumination, depth_map, caster.plane, caster.sight(), *rays, radiance)
             radiances.append(radiance)
             views.append(View(caster, inverse_depth, hit))
         return views[0], views[1], radiances[0], radiances[1]
@@ -122,8 +127,8 @@ class Renderer:
                 right_radiance *= steps / (steps + 1)
         return left, right, left_radiance, right_radiance
 
-    def _illumination(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The record of light and sky, and the shadow map, for `points` in the world."""
+    def _illumination(self) -> tuple[np.ndarray, np.ndarray]:
+        """The record of light and sky, and the inverse depth (S, S) in 1/m along the light's rays to what never moves."""
         light, sky = self.scene.light, self.scene.sky
         size = max(16, round(1.4 * float(np.sqrt(self.height * self.width))))
         forward = light.target - light.position
@@ -134,38 +139,46 @@ class Renderer:
         pose = np.eye(4)
         pose[:3, :3] = np.stack([side, np.cross(forward, side), forward])
         pose[:3, 3] = -pose[:3, :3] @ light.position
-        focal = 0.5 * size * distance / light.radius
-        middle = 0.5 * (size - 1)
-        if self.config.shadows:
-            caster = Caster(points, pose, self.soup.culled, np.array([focal, focal, middle, middle]), size, size)
-            inverse_depth, _ = caster.centres()
-            with np.errstate(divide="ignore"):
-                depth = (1 / inverse_depth).astype(np.float32)
-        else:
-            depth = np.full((size, size), np.inf, np.float32)
         record = np.zeros(1, ILLUMINATION)
         for name in ("position", "color", "above", "below", "falloff_m"):
             record[name] = getattr(light, name)
         for name in ("horizon", "zenith", "cloud_strength", "haze_per_m"):
             record[name] = getattr(sky, name)
-        record["shadow_pose"], record["shadow_focal"] = pose, focal
+        record["shadow_pose"], record["shadow_focal"] = pose, 0.5 * size * distance / light.radius
         record["shadow_bias_m"] = 2.0 * light.radius / size + 0.01
         record["gloss"] = self.config.gloss
-        return record, depth
+        still = np.delete(np.arange(len(self.points)), self.moving)
+        return record, self._towards_light(record, size, still) if self.config.shadows else np.zeros((size, size))
+
+    def _towards_light(self, illumination: np.ndarray, size: int, which: np.ndarray) -> np.ndarray:
+        """Inverse depth (S, S) in 1/m along the light's rays to the first of some triangles."""
+        focal, middle = float(illumination["shadow_focal"][0]), 0.5 * (size - 1)
+        intrinsics = np.array([focal, focal, middle, middle])
+        pose, culled = illumination["shadow_pose"][0], self.soup.culled[which]
+        return Caster(self.points[which], pose, culled, intrinsics, size, size).centres()[0]
+
+    def _shadows(self) -> np.ndarray:
+        """The shadow map (S, S) float32: depth in metres along the light's rays at present."""
+        inverse_depth = self.still
+        if self.config.shadows:
+            inverse_depth = np.maximum(self.still, self._towards_light(self.illumination, len(self.still), self.moving))
+        with np.errstate(divide="ignore"):
+            return (1 / inverse_depth).astype(np.float32)
 
 
 def truth_of(renderer: Renderer, left1: View, right1: View, left2: View, right2: View) -> Truth:
     """Exact truth of two stereo pairs; see `Truth`. Flow is NaN for points that lie behind the second camera."""
     scale = renderer.scene.camera.fx * renderer.scene.camera.baseline_m
-    pixels = np.moveaxis(np.indices(left1.hit.shape)[::-1], 0, -1)
     in_left2, inverse_depth2 = follow(left1, left2)
     in_right2, inverse_depth_right2 = follow(left1, right2)
     visible_flow = seen(left2, in_left2, inverse_depth2)
+    height, width = left1.hit.shape
+    flow = np.stack([in_left2[..., 0] - np.arange(width), in_left2[..., 1] - np.arange(height)[:, None]], -1)
     objects = np.where(left1.hit >= 0, renderer.soup.objects[left1.hit], 0).astype(np.int32)
     return Truth(
         disparity1=(scale * left1.inverse_depth).astype(np.float32),
         disparity2=(scale * inverse_depth2).astype(np.float32),
-        flow=(in_left2 - pixels).astype(np.float32),
+        flow=flow.astype(np.float32),
         disparity_left2=(scale * left2.inverse_depth).astype(np.float32),
         visible_stereo=seen(right1, *follow(left1, right1)),
         visible_flow=visible_flow,
@@ -226,6 +239,7 @@ def make_video(family: str, seed: int, height: int, width: int, frames: int, **o
     if frames < 2:
         raise InputError(f"a video has at least 2 frames, got {frames}")
     config = RenderConfig(**options)
+    keep_freed_memory()
     scene = make_scene(family, seed, height, width, config)
     rng = np.random.default_rng([sorted(FAMILIES).index(family), seed, 2])
     sensor = Sensor.random(rng, frames) if config.sensor else Sensor()

@@ -235,6 +235,10 @@ class Soup:
     objects : ndarray (N,) int32
     materials : ndarray of MATERIAL
     textures : list of Texture
+    places : list of ndarray (4, 4)
+        Of every part: from its own coordinates to the world's at time 0.
+    motions : list of Motion or None
+        Of every part.
     """
 
     points: np.ndarray
@@ -247,6 +251,8 @@ class Soup:
     objects: np.ndarray
     materials: np.ndarray
     textures: list[Texture]
+    places: list[np.ndarray]
+    motions: list[Motion | None]
 
     @classmethod
     def of(cls, scene: Scene) -> "Soup":
@@ -254,7 +260,7 @@ class Soup:
         parts = scene.parts
         counts = [len(part.mesh.points) for part in parts]
         of_part = np.repeat(np.arange(len(parts)), counts)
-        offsets = np.cumsum([0, *(int(part.mesh.surface.max()) + 1 for part in parts[:-1])])
+        offsets = np.cumsum([0, *(part.mesh.surfaces for part in parts[:-1])])
         unique = {id(part.material): part.material for part in parts}
         place = {key: index for index, key in enumerate(unique)}
         textures: dict[int, Texture] = {id(scene.sky.clouds): scene.sky.clouds}
@@ -263,16 +269,19 @@ class Soup:
                 if texture is not None:
                     textures.setdefault(id(texture), texture)
         slot = {key: index for index, key in enumerate(textures)}
-        records = np.zeros(len(unique), MATERIAL)
-        for record, material in zip(records, unique.values(), strict=True):
-            cos, sin = np.cos(material.turn) * material.scale, np.sin(material.turn) * material.scale
-            record["texture"] = slot[id(material.texture)]
-            record["detail"] = slot[id(material.detail or material.texture)]
-            record["color"] = material.color
-            record["uv"] = [[cos, -sin, material.offset[0]], [sin, cos, material.offset[1]]]
-            record["detail_strength"] = material.detail_strength if material.detail is not None else 0.0
-            for name in ("detail_scale", "specular", "shininess", "mirror", "glow"):
-                record[name] = getattr(material, name)
+        materials = list(unique.values())
+        records = np.zeros(len(materials), MATERIAL)
+        records["texture"] = [slot[id(material.texture)] for material in materials]
+        records["detail"] = [slot[id(material.detail or material.texture)] for material in materials]
+        records["color"] = [material.color for material in materials]
+        turn, scale = np.array([(material.turn, material.scale) for material in materials]).T
+        records["uv"][:, 0, 0] = records["uv"][:, 1, 1] = np.cos(turn) * scale
+        records["uv"][:, 1, 0] = np.sin(turn) * scale
+        records["uv"][:, 0, 1] = -records["uv"][:, 1, 0]
+        records["uv"][:, :, 2] = [material.offset for material in materials]
+        records["detail_strength"] = [material.detail_strength if material.detail is not None else 0.0 for material in materials]
+        for name in ("detail_scale", "specular", "shininess", "mirror", "glow"):
+            records[name] = [getattr(material, name) for material in materials]
         return cls(
             np.concatenate([part.mesh.points for part in parts]),
             np.concatenate([part.mesh.normals for part in parts]),
@@ -284,26 +293,28 @@ class Soup:
             np.array([part.object_id for part in parts], np.int32)[of_part],
             records,
             list(textures.values()),
+            [part.place for part in parts],
+            [part.motion for part in parts],
         )
 
-    def at(self, scene: Scene, time: float) -> tuple[np.ndarray, np.ndarray]:
-        """World coordinates of the corners and their normals at `time`, (N, 3, 3) each."""
-        places = np.stack([part.place for part in scene.parts])
-        moving = [index for index, part in enumerate(scene.parts) if part.motion is not None]
-        poses: dict[int, np.ndarray] = {}
-        for index in moving:
-            motion = scene.parts[index].motion
-            assert motion is not None
-            if id(motion) not in poses:
-                poses[id(motion)] = motion.pose(time)
-            places[index] = poses[id(motion)] @ places[index]
-        points, normals = np.empty_like(self.points), np.empty_like(self.normals)
-        _place(self.points, self.normals, self.part, places, points, normals)
-        return points, normals
+    @property
+    def moving(self) -> np.ndarray:
+        """Numbers of the triangles that are not always at the same place, (M,) int64."""
+        return np.flatnonzero(np.array([motion is not None for motion in self.motions])[self.part])
+
+    def at(self, time: float, which: np.ndarray, points: np.ndarray, normals: np.ndarray) -> None:
+        """Write the corners and normals of the triangles `which` (M,) at `time` in world coordinates, (N, 3, 3) each."""
+        poses = {id(motion): motion.pose(time) for motion in self.motions if motion is not None}
+        places = np.stack([
+            place if motion is None else poses[id(motion)] @ place
+            for place, motion in zip(self.places, self.motions, strict=True)
+        ])  # fmt: skip
+        _place(which, self.points, self.normals, self.part, places, points, normals)
 
 
 @rowwise
 def _place(
+    which: np.ndarray,
     points: np.ndarray,
     normals: np.ndarray,
     part: np.ndarray,
@@ -311,8 +322,9 @@ def _place(
     points_out: np.ndarray,
     normals_out: np.ndarray,
 ) -> None:
-    """Rigidly move every triangle by its part's matrix."""
-    for n in range(points.shape[0]):
+    """Rigidly move some triangles by their parts' matrices."""
+    for k in range(which.size):
+        n = which[k]
         m = places[part[n]]
         for c in range(3):
             for i in range(3):

@@ -115,7 +115,7 @@ class TextureSource:
     def kind(self, *names: str) -> Texture:
         """A random variant of one of the named kinds."""
         name = names[int(self.rng.integers(len(names)))]
-        return procedural(name, int(self.rng.choice(self.variants[name])))
+        return procedural(name, int(self.variants[name][self.rng.integers(VARIANTS_PER_SCENE)]))
 
     def any(self, *names: str) -> Texture:
         """A picture now and then, otherwise one of the named kinds (all kinds if none is named)."""
