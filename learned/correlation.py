@@ -140,9 +140,9 @@ def _forward(begin: int, end: int, first: np.ndarray, padded: np.ndarray, out: n
                 total = out[b, dy * size + dx, y]
                 total[:] = 0
                 for c in range(0, channels - 3, 4):
-                    _multiply_add_four(first, padded, b, c, y, dy, dx, total)
+                    multiply_add_four(first, padded, b, c, y, dy, dx, total)
                 for c in range(channels // 4 * 4, channels):
-                    _multiply_add(first[b, c, y], padded[b, c, y + dy, dx:], total)
+                    multiply_add(first[b, c, y], padded[b, c, y + dy, dx:], total)
                 for x in range(width):
                     total[x] *= scale
 
@@ -159,7 +159,7 @@ def _backward(begin: int, end: int, gradient: np.ndarray, padded: np.ndarray, ou
             total = out[b, c, y]
             for dy in range(size):
                 for dx in range(size):
-                    _multiply_add(gradient[b, dy * size + dx, y], padded[b, c, y + dy, dx:], total)
+                    multiply_add(gradient[b, dy * size + dx, y], padded[b, c, y + dy, dx:], total)
             for x in range(width):
                 total[x] *= scale
 
@@ -203,7 +203,7 @@ def _disparity_forward(begin: int, end: int, left: np.ndarray, right: np.ndarray
         b, g, y = job // (groups * height), job // height % groups, job % height
         for d in range(out.shape[2]):
             for c in range(channels):
-                _multiply_add(left[b, g, c, y, d:], right[b, g, c, y], out[b, g, d, y, d:])
+                multiply_add(left[b, g, c, y, d:], right[b, g, c, y], out[b, g, d, y, d:])
 
 
 @tasks
@@ -214,21 +214,21 @@ def _disparity_backward(begin: int, end: int, left: np.ndarray, right: np.ndarra
         b, g, y = job // (groups * height), job // height % groups, job % height
         for d in range(gradient.shape[2]):
             for c in range(channels):
-                _multiply_add(gradient[b, g, d, y, d:], right[b, g, c, y], to_left[b, g, c, y, d:])
-                _multiply_add(gradient[b, g, d, y, d:], left[b, g, c, y, d:], to_right[b, g, c, y])
+                multiply_add(gradient[b, g, d, y, d:], right[b, g, c, y], to_left[b, g, c, y, d:])
+                multiply_add(gradient[b, g, d, y, d:], left[b, g, c, y, d:], to_right[b, g, c, y])
 
 
 @lanes
-def _multiply_add(a: np.ndarray, b: np.ndarray, total: np.ndarray) -> None:
+def multiply_add(a: np.ndarray, b: np.ndarray, total: np.ndarray) -> None:
     """total += a b, as far as the shortest of them goes."""
     for x in range(min(a.size, b.size, total.size)):
         total[x] += a[x] * b[x]
 
 
 @lanes
-def _multiply_add_four(a: np.ndarray, b: np.ndarray, i: int, c: int, y: int, dy: int, dx: int, total: np.ndarray
+def multiply_add_four(a: np.ndarray, b: np.ndarray, i: int, c: int, y: int, dy: int, dx: int, total: np.ndarray
                        ) -> None:
-    """``_multiply_add`` of four channels at once: a quarter of the traffic of the total."""
+    """``multiply_add`` of four channels at once: a quarter of the traffic of the total."""
     for x in range(total.size):
         # unsigned: for a signed index numba asks whether it is negative, and nothing is vectorised
         at, there = np.uint64(x), np.uint64(x + dx)

@@ -15,6 +15,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from learned.correlation import correlation
+from learned.cosine_costs import cosine_costs
 from learned.threads import side_by_side
 from learned.transposed import DoublingConvolution2d
 from learned.warp import warp
@@ -183,10 +184,10 @@ class _Decoder(nn.Module):
                 ) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor] | None]:
         """Motion of this level, its dense features, and motion and features upsampled for the next level."""
         if coarser is None:
-            dense = self._costs(first, second)
+            dense = self._costs(first, second, None)
         else:
             upsampled, features = coarser
-            costs = self._costs(first, warp(second, upsampled[:, :2] * self.pixels))
+            costs = self._costs(first, second, upsampled[:, :2] * self.pixels)
             dense = torch.cat([costs, first, _planar(upsampled, first.dtype), features], 1)
         dense = _planar(dense, dense.dtype)  # or every convolution would convert it again
         for convolution in self.convolutions:
@@ -197,12 +198,11 @@ class _Decoder(nn.Module):
             motion = _precise(self.predict, dense)
         return motion, dense, None if self.finest else (self._upsample(motion), self.upsample_features(dense))
 
-    def _costs(self, first: Tensor, second: Tensor) -> Tensor:
-        if not self.config.cosine:
-            return F.leaky_relu(correlation(first, second, self.config.radius), 0.1)
-        dtype = first.dtype
-        volume = correlation(_normalised(first), _normalised(second), self.config.radius)
-        return F.leaky_relu(_planar(volume, dtype), 0.1)
+    def _costs(self, first: Tensor, second: Tensor, flow: Tensor | None) -> Tensor:
+        if self.config.cosine:
+            return cosine_costs(first, second, flow, self.config.radius)
+        second = second if flow is None else warp(second, flow)
+        return F.leaky_relu(correlation(first, second, self.config.radius), 0.1)
 
     def _upsample(self, motion: Tensor) -> Tensor:
         if self.config.residual:
@@ -218,16 +218,6 @@ def _precise(module: nn.Module, features: Tensor) -> Tensor:
     """Apply a module outside mixed precision: a motion of 100 px in bfloat16 is known to a third of a pixel only."""
     with torch.autocast(features.device.type, enabled=False):
         return module(_at_least_float32(features))
-
-
-def _normalised(features: Tensor) -> Tensor:
-    """Features (B, C, H, W) of mean square one at every pixel, in float32 or better, channels outermost.
-
-    The mean product of two, which correlation takes, is then their cosine.
-    """
-    features = _at_least_float32(features).contiguous()
-    # bounded before the root: its slope is infinite at zero, where warping looked outside
-    return features * (features.shape[1] / features.square().sum(1, keepdim=True).clamp(min=1e-24)).sqrt()
 
 
 def _planar(maps: Tensor, dtype: torch.dtype) -> Tensor:

@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 # A sample counts as valid only if its whole bilinear support lies inside (the published PWC-Net's threshold).
-_FULL_SUPPORT = 0.9999
+FULL_SUPPORT = 0.9999
 
 
 def warp(source: Tensor, flow: Tensor) -> Tensor:
@@ -38,7 +38,7 @@ def warp(source: Tensor, flow: Tensor) -> Tensor:
     # grid_sample has no mixed precision, and bfloat16 coordinates would be pixels off
     sampled = F.grid_sample(source.to(grid.dtype), grid, mode="bilinear", padding_mode="zeros", align_corners=True)
     with torch.no_grad():
-        valid = _inside(x, width) * _inside(y, height) >= _FULL_SUPPORT
+        valid = _inside(x, width) * _inside(y, height) >= FULL_SUPPORT
     return (sampled * valid[:, None]).to(source.dtype)
 
 

@@ -8,6 +8,7 @@ from learned.correlation import (
     correlation_reference,
     disparity_correlation,
 )
+from learned.cosine_costs import cosine_costs
 from learned.warp import warp
 
 
@@ -85,3 +86,29 @@ def test_shapes_that_do_not_fit_are_refused():
         correlation(_features(1, 2, 4, 5), _features(1, 2, 4, 6))
     with pytest.raises(ValueError, match="3 groups"):
         disparity_correlation(_features(1, 8, 4, 5), _features(1, 8, 4, 5), 4, groups=3)
+
+
+@pytest.mark.parametrize("moves", [False, True])
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 1e-5), (torch.bfloat16, 0.01)])
+@pytest.mark.parametrize(("shape", "radius"), [((2, 5, 7, 11), 4), ((1, 8, 9, 6), 1)])
+def test_the_cosine_kernels_do_what_is_written_plainly(shape, radius, dtype, tolerance, moves):
+    """With motion that crosses the border, and leads far outside."""
+    first, second = (_features(*shape, seed=s).to(dtype, memory_format=torch.channels_last) for s in (0, 1))
+    flow = 3 * _features(shape[0], 2, *shape[2:], seed=2) if moves else None
+    plain = cosine_costs(first, second, flow, radius)
+    with torch.no_grad():
+        fast = cosine_costs(first, second, flow, radius)
+        assert not torch.allclose(cosine_costs(second, first, flow, radius), plain, atol=0.1)
+    assert fast.dtype == dtype
+    assert fast.is_contiguous(memory_format=torch.channels_last)
+    torch.testing.assert_close(fast, plain, rtol=0, atol=tolerance)
+
+
+@torch.no_grad()
+def test_cosines_of_features_that_nothing_matches_are_zero():
+    features, flow = _features(1, 4, 5, 6), torch.zeros(1, 2, 5, 6)
+    flow[0, :, 2, 3] = torch.tensor([torch.nan, 1.0])
+    flow[0, 0, 1, 4] = 1e9
+    costs = cosine_costs(features, features, flow, 0)[0, 0]
+    assert costs[2, 3] == costs[1, 4] == 0
+    torch.testing.assert_close(costs.sum(), torch.tensor(28.0))
