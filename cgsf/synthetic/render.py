@@ -87,9 +87,10 @@ class Renderer:
         self.textures = np.concatenate([records, clouds])
         self.offsets = _QUARTERS if config.antialias else _QUARTERS[:0]
         self.points, self.normals = np.empty_like(self.soup.points), np.empty_like(self.soup.normals)
-        self.soup.at(0.0, np.arange(len(self.points)), self.points, self.normals)
         self.moving = self.soup.moving
-        self.illumination, self.still = self._illumination()
+        still = np.delete(np.arange(len(self.points)), self.moving)
+        self.soup.at(0.0, still, self.points, self.normals)
+        self.illumination, self.still = self._illumination(still)
 
     def stereo(self, time: float) -> tuple[View, View, np.ndarray, np.ndarray]:
         """Left and right view at `time` with their radiance, (H, W, 3) float32 each."""
@@ -127,8 +128,8 @@ class Renderer:
                 right_radiance *= steps / (steps + 1)
         return left, right, left_radiance, right_radiance
 
-    def _illumination(self) -> tuple[np.ndarray, np.ndarray]:
-        """The record of light and sky, and the inverse depth (S, S) in 1/m along the light's rays to what never moves."""
+    def _illumination(self, still: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The record of light and sky, and the inverse depth (S, S) in 1/m along the light's rays to what stands `still`."""
         light, sky = self.scene.light, self.scene.sky
         size = max(16, round(1.4 * float(np.sqrt(self.height * self.width))))
         forward = light.target - light.position
@@ -147,7 +148,6 @@ class Renderer:
         record["shadow_pose"], record["shadow_focal"] = pose, 0.5 * size * distance / light.radius
         record["shadow_bias_m"] = 2.0 * light.radius / size + 0.01
         record["gloss"] = self.config.gloss
-        still = np.delete(np.arange(len(self.points)), self.moving)
         return record, self._towards_light(record, size, still) if self.config.shadows else np.zeros((size, size))
 
     def _towards_light(self, illumination: np.ndarray, size: int, which: np.ndarray) -> np.ndarray:

@@ -5,6 +5,7 @@ z forward. Time is counted in frames. Everything moves rigidly: a world point x 
 ``pivot + velocity t + R(spin t) (x - pivot)`` at time t.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -81,13 +82,16 @@ class Motion:
     velocity: np.ndarray
     spin: np.ndarray
 
-    def pose(self, time: float) -> np.ndarray:
-        """(4, 4) matrix from world points at time 0 to the same points at `time`."""
-        matrix = np.eye(4)
-        if np.any(self.spin):
-            matrix[:3, :3] = Rotation.from_rotvec(np.asarray(self.spin, float) * time).as_matrix()
-        matrix[:3, 3] = self.pivot + np.asarray(self.velocity, float) * time - matrix[:3, :3] @ self.pivot
-        return matrix
+    @staticmethod
+    def poses(motions: Sequence["Motion"], time: float) -> np.ndarray:
+        """(K, 4, 4) matrices from world points at time 0 to the same points at `time`."""
+        matrices = np.tile(np.eye(4), (len(motions), 1, 1))
+        if len(motions):
+            spins = np.array([motion.spin for motion in motions], float)
+            matrices[:, :3, :3] = Rotation.from_rotvec(spins * time).as_matrix()
+        for matrix, motion in zip(matrices, motions, strict=True):
+            matrix[:3, 3] = motion.pivot + np.asarray(motion.velocity, float) * time - matrix[:3, :3] @ motion.pivot
+        return matrices
 
 
 @dataclass(frozen=True)
@@ -304,7 +308,8 @@ class Soup:
 
     def at(self, time: float, which: np.ndarray, points: np.ndarray, normals: np.ndarray) -> None:
         """Write the corners and normals of the triangles `which` (M,) at `time` in world coordinates, (N, 3, 3) each."""
-        poses = {id(motion): motion.pose(time) for motion in self.motions if motion is not None}
+        motions = {id(motion): motion for motion in self.motions if motion is not None}
+        poses = dict(zip(motions, Motion.poses(list(motions.values()), time), strict=True))
         places = np.stack([
             place if motion is None else poses[id(motion)] @ place
             for place, motion in zip(self.places, self.motions, strict=True)

@@ -77,7 +77,8 @@ class Sensor:
         across = np.repeat((2.0 * np.arange(width) / (width - 1) - 1.0) ** 2, 3)
         curve = np.linspace(0, 1, 1025) ** (2 * self.gamma)
         image = np.empty_like(radiance)
-        _expose(radiance, np.tile(factor, width), self.vignetting, across, curve, self.grey, np.empty(3 * width), image)
+        rows, out = radiance.reshape(-1, 3 * width), image.reshape(-1, 3 * width)
+        _expose(rows, np.tile(factor, width), self.vignetting, across, curve, self.grey, np.empty(3 * width), out)
         if self.blur_px > 0.2:
             image = cv2.GaussianBlur(image, (5, 5), self.blur_px)
         if self.read_noise > 0 or self.shot_noise > 0:
@@ -94,29 +95,25 @@ def _expose(
 ) -> None:  # fmt: skip
     """Gains, vignetting, clip and tone curve.
 
-    `factor`, `across` (3 W,): gain and squared place across the image of every value in a row; `curve` (K,) is a table
-    over the square root of the light; `light` (3 W,) is scratch.
+    `radiance`, `out` (H, 3 W); `factor`, `across` (3 W,): gain and squared place across the image of every value in a
+    row; `curve` (K,) is a table over the square root of the light; `light` (3 W,) is scratch.
     """
-    height, width = radiance.shape[0], radiance.shape[1]
+    height, count = radiance.shape
     last = curve.size - 2
     for row in range(height):
         y = 2.0 * row / (height - 1) - 1.0
-        for column in range(width):
-            for channel in range(3):
-                light[3 * column + channel] = radiance[row, column, channel] * factor[3 * column + channel]
+        for j in range(count):
+            light[j] = radiance[row, j] * factor[j]
         if grey:
-            for column in range(width):
-                j = 3 * column
+            for j in range(0, count, 3):
                 value = 0.114 * light[j] + 0.587 * light[j + 1] + 0.299 * light[j + 2]
                 light[j] = light[j + 1] = light[j + 2] = value
-        for j in range(3 * width):
+        for j in range(count):
             value = light[j] * (1.0 - vignetting * 0.5 * (across[j] + y * y))
             light[j] = math.sqrt(min(max(value, 0.0), 1.0)) * (last + 1)
-        for column in range(width):
-            for channel in range(3):
-                place = light[3 * column + channel]
-                i = min(int(place), last)
-                out[row, column, channel] = curve[i] + (place - i) * (curve[i + 1] - curve[i])
+        for j in range(count):
+            i = np.uint32(min(int(light[j]), last))
+            out[row, j] = curve[i] + (light[j] - i) * (curve[np.uint32(i + 1)] - curve[i])
 
 
 @rowwise

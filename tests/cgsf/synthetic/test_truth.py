@@ -84,7 +84,7 @@ def test_calibration_turns_truth_into_the_objects_rigid_motion() -> None:
         for part in scene.parts:
             whole = all(other.motion is part.motion for other in scene.parts if other.object_id == part.object_id)
             if part.motion is not None and whole:
-                motions[part.object_id] = part.motion.pose(1.0)
+                motions[part.object_id] = Motion.poses([part.motion], 1.0)[0]
         checked = 0
         for number, motion in motions.items():
             pixels = (truth.objects == number) & np.isfinite(points1).all(-1) & np.isfinite(points2).all(-1)
