@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from variational.initialise import Start, to_bytes
-from variational.rigid import RigidMotion, fit_motion
+from variational.rigid import RigidMotion, fit_surface
 
 
 @dataclass(frozen=True)
@@ -123,18 +123,11 @@ def find_marked_objects(
     first = np.column_stack([at1, disparity[y1, x1]])
     second = np.column_stack([at2, start.match2.disparity[y2, x2]])
     usable = (first[:, 2] > 0.5) & start.match2.matched[y2, x2] & (second[:, 2] > 0.5)
-    motions = []
+    motions: list[RigidMotion | None] = []
     for surface in surfaces:
         near = cv2.dilate(surface.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
         chosen = np.flatnonzero(usable & near[y1, x1])
         if len(chosen) < config.least_matches:
             continue
-        transform = fit_motion(first[chosen], second[chosen], projection)
-        if transform is None:
-            continue
-        homography = projection @ transform @ np.linalg.inv(projection)
-        moved = np.column_stack([first[chosen], np.ones(len(chosen))]) @ homography.T
-        distance = np.linalg.norm(moved[:, :3] / moved[:, 3:] - second[chosen], axis=1)
-        if np.count_nonzero(distance < 2.0) >= config.least_matches:
-            motions.append(RigidMotion(transform, homography, surface))
-    return motions
+        motions.append(fit_surface(surface, first[chosen], second[chosen], projection, config.least_matches / len(chosen)))
+    return [motion for motion in motions if motion is not None]

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from variational.initialise import Start, dense_inverse_search
-from variational.rigid import RigidMotion, fit_motion
+from variational.rigid import RigidMotion, fit_surface
 
 MARGIN = 16
 """Pixels around a surface that dense inverse search sees too."""
@@ -174,16 +174,12 @@ def find_objects(
 
     Parameters
     ----------
-    start : Start
-        For the disparity at time 2.
-    disparity : np.ndarray
-        (H, W) at time 1, pixels.
-    left1, left2 : np.ndarray
+    start, disparity, left1, projection
+        As in variational.landmarks.find_marked_objects.
+    left2 : np.ndarray
         (H, W) grey in [0, 1].
     surfaces : list of np.ndarray
         (H, W) bool masks, the largest first.
-    projection : np.ndarray
-        (4, 4) of the camera.
     config : ObjectsConfig
     most_points : int
         Points of a surface that a motion is fitted to, drawn evenly.
@@ -194,7 +190,7 @@ def find_objects(
         One for each surface that is seen again and moves rigidly.
     """
     height, width = disparity.shape
-    motions = []
+    motions: list[RigidMotion | None] = []
     for surface in surfaces[: config.most]:
         followed = follow(left1, left2, surface, config)
         if followed is None:
@@ -209,12 +205,5 @@ def find_objects(
         if len(usable) < config.least_points:
             continue
         chosen = usable[np.linspace(0, len(usable) - 1, min(most_points, len(usable))).astype(np.intp)]
-        transform = fit_motion(first[chosen], second[chosen], projection)
-        if transform is None:
-            continue
-        homography = projection @ transform @ np.linalg.inv(projection)
-        moved = np.column_stack([first[chosen], np.ones(len(chosen))]) @ homography.T
-        distance = np.linalg.norm(moved[:, :3] / moved[:, 3:] - second[chosen], axis=1)
-        if np.mean(distance < 2.0) >= config.inliers:
-            motions.append(RigidMotion(transform, homography, surface))
-    return motions
+        motions.append(fit_surface(surface, first[chosen], second[chosen], projection, config.inliers))
+    return [motion for motion in motions if motion is not None]

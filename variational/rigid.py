@@ -247,6 +247,19 @@ def _gauss_newton(
     return transform
 
 
+def fit_surface(
+    surface: np.ndarray, first: np.ndarray, second: np.ndarray, projection: np.ndarray, share: float
+) -> RigidMotion | None:
+    """The motion of a surface (H, W) bool, if at least a `share` of its points follow it within 2 px; else as `fit_motion`."""
+    transform = fit_motion(first, second, projection)
+    if transform is None:
+        return None
+    homography = projection @ transform @ np.linalg.inv(projection)
+    moved = np.column_stack([first, np.ones(len(first))]) @ homography.T
+    distance = np.linalg.norm(moved[:, :3] / moved[:, 3:] - second, axis=1)
+    return RigidMotion(transform, homography, surface) if np.mean(distance < 2.0) >= share else None
+
+
 def _thin(valid: np.ndarray, count: int) -> np.ndarray:
     """(n,) flat indices of at most `count` of the set pixels, evenly spread."""
     indices = np.flatnonzero(valid)
