@@ -22,16 +22,15 @@ class Source:
 
     cache: SampleCache
     starts: StartCache | None = None
-    rivals: StartCache | None = None
 
     @staticmethod
-    def open(cache: str, starts: str = "", rivals: str = "") -> Source:
-        """From folders; those that are empty words are left out. `InputError` if they do not belong together."""
+    def open(cache: str, starts: str = "") -> Source:
+        """From folders, without starts if that is an empty word. `InputError` if they do not belong together."""
         samples = SampleCache(cache)
-        return Source(samples, *(_starts(folder, samples) if folder else None for folder in (starts, rivals)))
+        return Source(samples, _starts(starts, samples) if starts else None)
 
     def __len__(self) -> int:
-        return min(len(part) for part in (self.cache, self.starts, self.rivals) if part is not None)
+        return min(len(part) for part in (self.cache, self.starts) if part is not None)
 
     def __getitem__(self, index: int) -> Batch:
         """One sample as a batch; its images are bytes."""
@@ -40,9 +39,8 @@ class Source:
         if self.starts is None:
             return plain
         known = {name: torch.from_numpy(np.array(array)[None]) for name, array in self.starts[index].items()}
-        rival = None if self.rivals is None else torch.from_numpy(np.array(self.rivals[index]["start"])[None])
         return replace(
-            plain, start=known["start"], backward_flow=known["backward"], evidence=known["evidence"], rival=rival,
+            plain, start=known["start"], backward_flow=known["backward"], evidence=known["evidence"],
             homography=known["homography"],
         )  # fmt: skip
 
@@ -91,12 +89,10 @@ def further_sources(recipe: Recipe) -> list[Source]:
         return []
     if recipe.cached_networks:
         raise InputError("further samples are for single networks and refiners, not for joint training from starts")
-    refines = recipe.stage == "refiner"
-    starts = recipe.further_starts if refines else ("",) * len(recipe.further)
-    rivals = recipe.further_rivals if refines and recipe.rivals else ("",) * len(recipe.further)
-    if not len(starts) == len(rivals) == len(recipe.further):
-        raise InputError("each folder of further samples needs its further_starts, and its further_rivals if rivals are weighed")
-    return [Source.open(*folders) for folders in zip(recipe.further, starts, rivals, strict=True)]
+    starts = recipe.further_starts if recipe.stage == "refiner" else ("",) * len(recipe.further)
+    if len(starts) != len(recipe.further):
+        raise InputError("each folder of further samples needs its further_starts")
+    return [Source.open(*folders) for folders in zip(recipe.further, starts, strict=True)]
 
 
 def _starts(folder: str, cache: SampleCache) -> StartCache:

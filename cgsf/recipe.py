@@ -39,8 +39,6 @@ class Recipe:
     starts: str = ""
     """Refiner: folder of the states that it starts from (`cgsf.start_cache`). Joint: what networks that are frozen
     would say, in place of running them."""
-    rivals: str = ""
-    """Refiner: folder of the rivals' states, another method's starts of the same samples, for a refiner that weighs them."""
     weights: str = ""
     """Begin with these (the name of ones that ship, or a .safetensors file) in place of random ones; joint: the
     refiner's."""
@@ -54,8 +52,6 @@ class Recipe:
     """Folders of further samples to train with, such as real ones with what a method says for truth."""
     further_starts: tuple[str, ...] = ()
     """Refiner: the starts of each of those folders."""
-    further_rivals: tuple[str, ...] = ()
-    """Refiner: the rivals of each of those folders."""
     further_share: float = 0.2
     """How often a sample is one of those."""
     batch: int = 4
@@ -103,14 +99,10 @@ def read_recipe(recipe: str | Path) -> Recipe:
     return from_table(Recipe, table)
 
 
-def with_changes(
-    recipe: Recipe, cache: str | None = None, starts: str | None = None, rivals: str | None = None, steps: int | None = None
-) -> Recipe:
+def with_changes(recipe: Recipe, cache: str | None = None, starts: str | None = None, steps: int | None = None) -> Recipe:
     """The recipe with other folders or another length."""
     training = recipe.training if steps is None else replace(recipe.training, steps=steps)
-    return replace(
-        recipe, cache=cache or recipe.cache, starts=starts or recipe.starts, rivals=rivals or recipe.rivals, training=training
-    )  # fmt: skip
+    return replace(recipe, cache=cache or recipe.cache, starts=starts or recipe.starts, training=training)
 
 
 def claim(folder: Path, recipe: Recipe) -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from cgsf.errors import InputError
-from cgsf.feedforward import FeedforwardConfig, load_network, run_networks
+from cgsf.feedforward import FeedforwardConfig, load_network
 from cgsf.scene_flow import SceneFlow
 from cgsf.starts import StartConfig, make_start, to_batch
 from cgsf.steps_picture import StepsRecorder, write_steps_picture
@@ -20,7 +20,6 @@ from variational.terms.visibility import visible_mask
 if TYPE_CHECKING:
     from torch import Tensor, nn
 
-    from learned.batch import Batch
     from learned.feedforward import FeedforwardModule
     from learned.hybrid import Watch
     from learned.refiner import Refiner
@@ -121,18 +120,9 @@ class Strategist:
         from learned.strategies import apply_strategy
 
         begin = time.perf_counter()
-        batch = self._with_rival(frames, to_batch(frames, start, camera)).to(self.config.device)
+        batch = to_batch(frames, start, camera).to(self.config.device)
         refined = apply_strategy(self.strategy, batch, self.refiner, self.networks, watch=watch)
         return self.result(start, refined.state, time.perf_counter() - begin)
-
-    def _with_rival(self, frames: Frames, batch: Batch) -> Batch:
-        """The batch with the networks' state, for a refiner that weighs it against the start."""
-        if self.refiner is None or not self.refiner.config.rival:
-            return batch
-        import torch
-
-        networks = run_networks(frames, replace(self.config.feedforward, device=self.config.device))
-        return replace(batch, rival=torch.from_numpy(networks.state())[None])
 
     def adapt(self, frames: Frames, start: SceneFlow) -> SceneFlow:
         """As a call, for the next frame of a video: the networks stay adapted (strategy parameters only)."""

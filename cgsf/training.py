@@ -66,14 +66,12 @@ def train(recipe: Recipe, folder: str | Path, seconds: float = float("inf"), pro
         If the samples are missing, or the folder holds another recipe's run.
     """
     folder = Path(folder)
-    if bool(recipe.rivals) != (recipe.stage == "refiner" and recipe.refiner.rival):
-        raise InputError("rivals and a refiner that weighs them (rival = true, stage refiner) go together: give both or neither")
     if recipe.starts and recipe.stage == "joint" and not recipe.cached_networks:
         raise InputError('starts take the place of networks that are frozen, as training.frozen = ["feedforward"]')
     if recipe.stage == "refiner" and not recipe.starts:
         raise InputError("a refiner needs starts")
     needs_starts = recipe.stage == "refiner" or recipe.cached_networks
-    source = Source.open(recipe.cache, recipe.starts if needs_starts else "", recipe.rivals)
+    source = Source.open(recipe.cache, recipe.starts if needs_starts else "")
     batches = Batches(recipe, source, further_sources(recipe))
     if batches.count < 1:
         raise InputError(f"{recipe.cache}: {len(source)} samples, of which {recipe.held_out} are held out: none to train with")

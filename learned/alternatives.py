@@ -1,5 +1,5 @@
-"""Values that a pixel may take over in place of its own: those of its neighbours, of the camera's motion, of the second
-pair, and of a rival, another method's state of the same images.
+"""Values that a pixel may take over in place of its own: those of its neighbours, of the camera's motion and of the second
+pair.
 
 A sum of small corrections cannot mend an error of thirty pixels behind an occlusion, and a network whose corrections
 are that large spoils images unlike those it was trained on. Values that something else vouches for carry their scale
@@ -247,23 +247,6 @@ def gated_change(state: Tensor, alternatives: Alternatives, correction: Tensor, 
     moved = moved + motion_camera * (camera - motion - moved)
     moved = torch.cat([moved[:, :1] + change_far * residual, moved[:, 1:]], 1)
     return torch.cat([mended, torch.zeros_like(d1), moved], 1) + correction
-
-
-def adopted_change(change: Tensor, state: Tensor, rival: Tensor, gates: Tensor, grid: Grid) -> Tensor:
-    """The change (B, 5, H, W), in pixels, after gates have let in a rival's values, pixel by pixel.
-
-    Parameters
-    ----------
-    change, state, rival : Tensor (B, 5, H, W)
-        The change without the rival; what it is a change of; the rival's state.
-    gates : Tensor (B, 2 divisor**2, h, w)
-        Of the disparities D1 and D2, and of the motion, in the order of a pixel shuffle. Their hyperbolic tangents count.
-    grid : Grid
-    """
-    height, width = state.shape[-2:]
-    disparity, motion = F.pixel_shuffle(gates.float().tanh(), grid.divisor)[..., :height, :width].split(1, 1)
-    missing = rival - state - change
-    return change + torch.cat([disparity * missing[:, :2], motion * missing[:, 2:]], 1)
 
 
 def reliability_loss(logits: Tensor, state: Tensor, truth: Tensor) -> Tensor:

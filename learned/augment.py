@@ -39,9 +39,6 @@ class AugmentConfig:
     """Share of the colour change that is drawn for each of the four images apart."""
     noise: float = 0.02
     """Largest standard deviation of added noise, in the images' unit."""
-    spoil: float = 0.0
-    """How often a rival's disparities, and its motion, are made wrong in parts: who learns to weigh it shall ask for evidence
-    and not count on how good the rival happens to be on the images of training."""
     erase: float = 0.3
     """How often a rectangle of right1, left2 or right2 is replaced by the image's mean colour: hidden pixels."""
 
@@ -71,8 +68,6 @@ def _recoordinated(batch: Batch, x: tuple[float, float], y: tuple[float, float])
 
 def _augment_one(sample: Batch, config: AugmentConfig, generator: Generator) -> Batch:
     sample = _zoomed_crop(sample, config, generator)
-    if sample.rival is not None:
-        sample = replace(sample, rival=_spoiled(sample.rival, config.spoil, generator))
     images = _recolour(sample.images[0], config, generator)
     if _uniform(generator) < config.erase:
         _erase(images[1 + int(3 * _uniform(generator))], generator)
@@ -122,7 +117,6 @@ def resized(batch: Batch, size: tuple[int, int]) -> Batch:
         start=nearest(batch.start, factors),
         backward_flow=nearest(batch.backward_flow, factors[3:]),
         evidence=nearest(batch.evidence, None),
-        rival=nearest(batch.rival, factors),
     )
 
 
@@ -145,7 +139,6 @@ def _mirrored(batch: Batch) -> Batch:
         start=flip(batch.start, 4),
         backward_flow=flip(batch.backward_flow, 1),
         evidence=flip(batch.evidence, None),
-        rival=flip(batch.rival, 4),
     )
 
 
@@ -169,20 +162,6 @@ def _erase(image: Tensor, generator: Generator) -> None:
     h, w = (int(side * (0.1 + 0.25 * _uniform(generator))) for side in (height, width))
     top, left = int((height - h) * _uniform(generator)), int((width - w) * _uniform(generator))
     image[:, top : top + h, left : left + w] = image.mean((-2, -1), keepdim=True)
-
-
-def _spoiled(rival: Tensor, how_often: float, generator: Generator) -> Tensor:
-    """A rival (1, 5, H, W) that errs smoothly, as real ones do, by a pixel or by forty in a part of the image."""
-    spoiled = rival.clone()
-    height, width = rival.shape[-2:]
-    for channels, errors in ((slice(0, 2), 1), (slice(2, 5), 3)):  # both disparities alike; the motion
-        if _uniform(generator) >= how_often:
-            continue
-        cell, size, least = 12 * 8 ** _uniform(generator), 1.5 * 25 ** _uniform(generator), 2 * _uniform(generator) - 1
-        fields = torch.randn(1, 1 + errors, math.ceil(height / cell) + 2, math.ceil(width / cell) + 2, generator=generator)
-        where, error = F.interpolate(fields, (height, width), mode="bicubic", align_corners=False).split([1, errors], 1)
-        spoiled[:, channels] += torch.where(where > least, size * error, 0)
-    return spoiled
 
 
 def _uniform(generator: Generator) -> float:

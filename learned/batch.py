@@ -26,8 +26,6 @@ class Batch:
         Flow left2 -> left1 on left2's grid that belongs to the start.
     evidence : Tensor (B, n, H, W) or None
         What else the start's maker says about each pixel, in [0, 1] (confidence, visibility).
-    rival : Tensor (B, 5, H, W) or None
-        Another method's state of the same images: a second opinion.
     homography : Tensor (B, 4, 4) or None
         The camera's motion on (x, y, disparity, 1) of left1, float64.
     names : tuple of str
@@ -39,7 +37,6 @@ class Batch:
     start: Tensor | None = None
     backward_flow: Tensor | None = None
     evidence: Tensor | None = None
-    rival: Tensor | None = None
     homography: Tensor | None = None
     names: tuple[str, ...] = ()
 

@@ -64,14 +64,6 @@ def refine(
     if refiner.config.weighs_energies and steps > 0:
         assert oracle is not None
         camera_loss, _ = oracle.features(still(batch.start, batch.homography))
-    rival_losses = None
-    if refiner.config.rival and steps > 0:
-        assert oracle is not None
-        if batch.rival is None:
-            raise ValueError("this refiner weighs a rival: another method's state of the same images is needed")
-        crossed = [(batch.rival, batch.start), (batch.start, batch.rival)]
-        mixed = (torch.cat([disparities[:, :2], motion[:, 2:]], 1) for disparities, motion in crossed)
-        rival_losses = torch.stack([oracle.features(state)[0] for state in mixed], 1)
     contrasts = refiner.contrasts(batch)
     states, reliabilities = [batch.start], []
     for t in range(steps + 1):
@@ -82,7 +74,7 @@ def refine(
             watch(t, states[-1], loss, gradient)
         if t < steps:
             state = states[-1].detach() if refiner.config.detached else states[-1]
-            update = refiner(View(state, loss, gradient, camera_loss, rival_losses, contrasts), batch)
+            update = refiner(View(state, loss, gradient, camera_loss, contrasts), batch)
             states.append(state + update.change)
             reliabilities.append(update.reliability)
     return Refinement(states, reliabilities)

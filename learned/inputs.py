@@ -36,8 +36,6 @@ class View(NamedTuple):
     """(B, 5, H, W): of the energy."""
     camera_loss: Tensor | None = None
     """(B, H, W): the energy's map if everything followed the camera's motion."""
-    rival_losses: Tensor | None = None
-    """(B, 2, H, W): the energy's map with the rival's disparities, and with its motion."""
     contrasts: Tensor | None = None
     """(B, k, h, w): of left1, between neighbours."""
 
@@ -116,10 +114,6 @@ def _input(name: str, config: RefinerConfig, grid: Grid, view: View, batch: Batc
             return grid.pick(batch.evidence) - 0.5
         case "camera loss" if view.camera_loss is not None and view.loss is not None:
             return _signed_log(_mean((view.camera_loss - view.loss)[:, None], grid))
-        case "rival" if batch.rival is not None:
-            return _signed_log(grid.pick(batch.rival) - picked)
-        case "rival losses" if view.rival_losses is not None and view.loss is not None:
-            return _signed_log(_mean(view.rival_losses - view.loss[:, None], grid))
         case "within":
             return _signed_log(torch.cat([_within(view.state[:, channel : channel + 1], grid) for channel in (0, 3)], 1))
     raise ValueError(f"this refiner needs the input {name!r}")

@@ -15,15 +15,15 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from learned.alternatives import Alternatives, Grid, Neighbours, adopted_change, gated_change
+from learned.alternatives import Alternatives, Grid, Neighbours, gated_change
 from learned.batch import Batch
 from learned.inputs import Input, View, look
 
 # Affinity of neighbours falls by this factor's exponential with their difference in intensity, before training.
 _EDGE_SHARPNESS = 10.0
 # Gates: D1 from its neighbours and from the second pair, motion from its neighbours and the camera's, C from the second
-# pair; then both disparities and motion from the rival.
-_GATES, _RIVAL_GATES = 5, 2
+# pair.
+_GATES = 5
 
 
 @dataclass(frozen=True)
@@ -43,8 +43,6 @@ class RefinerConfig:
     neighbours: tuple[int, ...] = ()
     """Distances, in blocks, of neighbours whose values a pixel may take over, as those of the camera's motion and of the
     second pair; empty as published: corrections alone."""
-    rival: bool = False
-    """Whether a pixel may take over a rival's values too: another method's state (`Batch.rival`)."""
     detached: bool = False
     """Each step learns from its own loss alone, none through the steps before: a half of the training time."""
     steps: int = 5
@@ -56,8 +54,6 @@ class RefinerConfig:
             raise ValueError(f"inputs must be different ones of {', '.join(get_args(Input))}; got {self.inputs}")
         if (self.evidence > 0) != ("evidence" in self.inputs):
             raise ValueError("evidence must count the channels of the input 'evidence', 0 without it")
-        if self.rival and not (self.neighbours and "loss" in self.inputs):
-            raise ValueError("a refiner with a rival must have neighbours, and the energy's map among its inputs, to compare")
         if self.divisor < 1 or self.steps < 0 or not self.layers or any(distance < 1 for distance in self.neighbours):
             raise ValueError("divisor and distances must be at least 1, steps not negative, and there must be a hidden layer")
 
@@ -69,7 +65,6 @@ class RefinerConfig:
         if self.neighbours:
             layout |= {"camera": 3, "residual": 1, "round trip": 1}
             layout |= {"camera loss": 1} if self.weighs_energies else {}
-            layout |= {"rival": 5, "rival losses": 2} if self.rival else {}
             layout["within"] = 2 * (self.divisor**2 - 1)
         return layout
 
@@ -131,7 +126,7 @@ class Refiner(nn.Module):
             self.neighbours = Neighbours(config.neighbours)
             self.reliability = nn.Conv2d(channels, 2, 1)
             self.preference = nn.Conv2d(channels, len(self.neighbours.offsets), 1)
-            self.gates = nn.Conv2d(channels, (_GATES + _RIVAL_GATES * config.rival) * config.divisor**2, 1)
+            self.gates = nn.Conv2d(channels, _GATES * config.divisor**2, 1)
             self.edge_sharpness = nn.Parameter(torch.tensor(_EDGE_SHARPNESS))
             heads += [self.reliability, self.preference, self.gates]
         for layer in heads:
@@ -161,11 +156,7 @@ class Refiner(nn.Module):
         reliability, preference, gates = self._heads(x)
         assert view.contrasts is not None
         mixture = self.neighbours.mixture(seen.picked, preference, view.contrasts, self.edge_sharpness, reliability)
-        gates, rival_gates = gates.tensor_split((_GATES * self.config.divisor**2,), 1)
         change = gated_change(state, Alternatives(mixture, seen.camera, seen.residual), correction, gates, self.grid)
-        if self.config.rival:
-            assert batch.rival is not None
-            change = adopted_change(change, state, batch.rival, rival_gates, self.grid)
         return Update(change, reliability.float())
 
     def _heads(self, x: Tensor) -> tuple[Tensor, ...]:

@@ -114,33 +114,6 @@ def test_every_stage_trains_and_exports(folder, tmp_path, stage):
     assert "2 steps" in (tmp_path / "net.safetensors.md").read_text()
 
 
-def test_a_refiner_weighs_the_networks_state(folder, tmp_path):
-    """From two caches of states to a pipeline that runs the networks beside the solver."""
-    disparity, motion = weights(tmp_path)
-    networks = load_start_config("feedforward", disparity=disparity, motion=motion)
-    write_starts(tmp_path / "rivals", SampleCache(folder / "cache"), networks)
-    settings = recipe(folder, "refiner", rivals=str(tmp_path / "rivals"), refiner=dataclasses.replace(SMALL_REFINER, rival=True))
-    batches = Batches(settings, Source.open(settings.cache, settings.starts, settings.rivals))
-    np.testing.assert_array_equal(batches.source[2].rival[0], StartCache(settings.rivals)[2]["start"])
-    train(settings, tmp_path / "run")
-    trained = STAGES["refiner"].network(settings)
-    with torch.no_grad():
-        trained.gates.bias[-4:] = 20.0  # motion from the rival, wide open
-    save(trained, tmp_path / "r.safetensors", ModelCard("a test"))
-    preset = tmp_path / "preset.toml"
-    tables = {"feedforward": {"disparity": disparity, "motion": motion}, "refined": {"refiner": f"{tmp_path}/r.safetensors"}}
-    preset.write_text(toml(tables))
-    images = scenes.plane(np.random.default_rng(0), 70, 100)
-    refined = cgsf.estimate(*images, method="variational+refiner", preset=str(preset))
-    rival = cgsf.estimate(*images, method="feedforward", preset=str(preset))
-    np.testing.assert_allclose(refined.flow, rival.flow, atol=1e-3)
-    assert np.abs(refined.initial.flow - rival.flow).max() > 1
-    write_cache(tmp_path / "others", ["other"], make, SIZE)
-    write_starts(tmp_path / "wrong", SampleCache(tmp_path / "others"), StartConfig("opencv"))
-    with pytest.raises(InputError, match="other samples"):
-        train(dataclasses.replace(settings, rivals=str(tmp_path / "wrong")), tmp_path / "other")
-
-
 def toml(table: dict, name: str = "") -> str:
     """Plain values and nested tables, enough for a recipe."""
     lines = [f"[{name}]"] if name else []
@@ -214,19 +187,17 @@ def test_further_samples_are_drawn_now_and_then(folder, tmp_path):
 
 
 def test_further_samples_of_a_refiner_bring_their_starts(folder, tmp_path):
-    """And their rivals; all of another size."""
+    """Of another size, too."""
     further = write_cache(tmp_path / "more", NAMES[:2], make, (60, 80))
     write_starts(tmp_path / "more-starts", further, StartConfig("opencv"))
     folders = {"further": (str(further.folder),), "further_starts": (str(tmp_path / "more-starts"),), "further_share": 1.0}
-    rivals = {"rivals": str(folder / "starts"), "further_rivals": folders["further_starts"]}
-    weighs = dataclasses.replace(SMALL_REFINER, rival=True)
-    for settings in (recipe(folder, "refiner", **folders), recipe(folder, "refiner", refiner=weighs, **folders, **rivals)):
-        sources = further_sources(settings)
-        batch = Batches(settings, Source.open(settings.cache, settings.starts, settings.rivals), sources)(0)
-        assert batch.start.shape == (2, 5, 48, 64)
-        assert (batch.rival is not None) == bool(settings.rivals)
-        np.testing.assert_array_equal(sources[0][1].start[0], StartCache(tmp_path / "more-starts")[1]["start"])
-        assert np.isfinite(train(settings, tmp_path / f"run{settings.refiner.rival}")["score"])
+    settings = recipe(folder, "refiner", **folders)
+    sources = further_sources(settings)
+    assert Batches(settings, Source.open(settings.cache, settings.starts), sources)(0).start.shape == (2, 5, 48, 64)
+    np.testing.assert_array_equal(sources[0][1].start[0], StartCache(tmp_path / "more-starts")[1]["start"])
+    assert np.isfinite(train(settings, tmp_path / "run")["score"])
+    with pytest.raises(InputError, match="other samples"):
+        train(dataclasses.replace(settings, further_starts=(str(folder / "starts"),)), tmp_path / "other")
 
 
 def test_supervision_without_truth(folder, tmp_path):
@@ -345,7 +316,6 @@ def test_bad_input_is_one_clear_line(folder, tmp_path):
         "is no cache of starts": lambda: train(recipe(folder, "refiner", starts=str(tmp_path)), tmp_path / "other"),
         "held out": lambda: train(recipe(folder, "flow", held_out=4), tmp_path / "third"),
         "that are frozen": lambda: train(joint(folder, starts=str(folder / "starts")), tmp_path / "fourth"),
-        "go together": lambda: train(recipe(folder, "refiner", rivals=str(folder / "starts")), tmp_path / "sixth"),
         "its further_starts": lambda: train(recipe(folder, "refiner", further=(str(folder / "cache"),)), tmp_path / "fifth"),
         "a refiner needs starts": lambda: train(recipe(folder, "refiner", starts=""), tmp_path / "seventh"),
         "for ablations": lambda: export_best(recipe(folder, "refiner", energy=EnergyConfig(0)), energy_run, "x.safetensors"),

@@ -61,33 +61,6 @@ def test_mirroring_turns_vertical_motion(batch: Batch):
     assert torch.equal(mirrored[0].backward_flow[0, 1], -batch.backward_flow[0, 1].flip(-2))
 
 
-def test_a_rival_is_changed_as_the_start_is(batch: Batch):
-    start = torch.randn(batch.truth.shape, generator=generator(7))
-    config = dataclasses.replace(PLAIN, zoom=0.4, stretch=0.2, flip=True)
-    for seed in range(4):
-        changed = augment(dataclasses.replace(batch, start=start, rival=start), config, generator(seed))
-        assert torch.equal(changed.rival, changed.start)
-
-
-def test_a_rival_is_spoiled_in_parts_alone(batch: Batch):
-    """Some pixels by much, others not at all; both disparities alike; nothing else is touched."""
-    start = torch.randn(batch.truth.shape, generator=generator(7))
-    sample, config = dataclasses.replace(batch, start=start, rival=start), dataclasses.replace(PLAIN, spoil=1.0)
-    shares, sizes = [], []
-    for seed in range(20):
-        changed = augment(sample, config, generator(seed))
-        error = changed.rival - changed.start
-        assert torch.allclose(error[:, 0], error[:, 1], atol=1e-4)
-        shares.append(float((error[:, 0] != 0).float().mean()))
-        sizes.append(float(error[:, 3].abs().max()))
-    assert min(shares) < 0.3
-    assert max(shares) > 0.7
-    assert min(sizes) < 5
-    assert max(sizes) > 20
-    never = augment(sample, dataclasses.replace(config, spoil=0.0), generator())
-    assert torch.equal(never.rival, never.start)
-
-
 def test_colour_changes_all_images_alike_but_for_a_part(batch: Batch):
     config = dataclasses.replace(PLAIN, colour=0.3, unequal=0.0)
     images = augment(batch, config, generator()).images[0]

@@ -14,7 +14,6 @@ from learned.oracle import Oracle
 from learned.refiner import COMPACT, Refiner, RefinerConfig
 
 SMALL = dataclasses.replace(COMPACT, layers=((8, 1), (8, 2)), neighbours=(1, 3), steps=3)
-SMALL_RIVAL = dataclasses.replace(SMALL, rival=True)
 HEIGHT, WIDTH = 37, 51
 
 
@@ -41,9 +40,8 @@ def test_published_sizes():
     assert shapes == [(512, 11, 3, 3), (512, 512, 3, 3), (5, 512, 3, 3)]
 
 
-@pytest.mark.parametrize("config", [RefinerConfig(layers=((8, 1), (8, 1)), steps=2), SMALL, SMALL_RIVAL])
+@pytest.mark.parametrize("config", [RefinerConfig(layers=((8, 1), (8, 1)), steps=2), SMALL])
 def test_untrained_changes_nothing(batch: Batch, config: RefinerConfig):
-    batch = dataclasses.replace(batch, rival=batch.start + 1)
     states = refine(Refiner(config), batch).states
     assert len(states) == config.steps + 1
     for state in states:
@@ -218,21 +216,7 @@ def test_the_gates_kernel_does_what_is_written_plainly(divisor: int, size: tuple
         assert torch.allclose(gated_change(state, offers, correction, gates, Grid(divisor)), plain, atol=1e-4)
 
 
-def test_a_rivals_values_come_in_pixel_by_pixel():
-    """Disparities through one gate, motion through the other; in whole they replace state and change."""
-    generator = torch.Generator().manual_seed(4)
-    change, state, rival = torch.randn(3, 1, 5, 5, 7, generator=generator)
-    for group, channels in enumerate(([0, 1], [2, 3, 4])):
-        gates = torch.zeros(1, 8, 3, 4)
-        gates[:, 4 * group + 1] = OPEN  # the upper right pixel of each block
-        result = state + alternatives.adopted_change(change, state, rival, gates, Grid(2))
-        expected = state + change
-        for channel in channels:
-            expected[0, channel, ::2, 1::2] = rival[0, channel, ::2, 1::2]
-        assert torch.allclose(result, expected, atol=1e-6)
-
-
-KINDS = [SMALL, SMALL_RIVAL, dataclasses.replace(SMALL, inputs=("state",)), dataclasses.replace(SMALL, divisor=1),
+KINDS = [SMALL, dataclasses.replace(SMALL, inputs=("state",)), dataclasses.replace(SMALL, divisor=1),
          dataclasses.replace(SMALL, inputs=("gradient", "evidence", "deviation", "loss"), evidence=3, divisor=3)]  # fmt: skip
 
 
@@ -240,11 +224,11 @@ KINDS = [SMALL, SMALL_RIVAL, dataclasses.replace(SMALL, inputs=("state",)), data
 def test_the_inputs_kernel_does_what_is_written_plainly(batch: Batch, config: RefinerConfig):
     generator = torch.Generator().manual_seed(2)
     homography = torch.eye(4, dtype=torch.float64) + 0.01 * torch.randn(2, 4, 4, generator=generator)
-    evidence, rival = (torch.rand(2, n, HEIGHT, WIDTH, generator=generator) for n in (3, 5))
-    batch = dataclasses.replace(batch, homography=homography, evidence=evidence, rival=rival)
+    evidence = torch.rand(2, 3, HEIGHT, WIDTH, generator=generator)
+    batch = dataclasses.replace(batch, homography=homography, evidence=evidence)
     loss, camera_loss = 30 * torch.rand(2, 2, HEIGHT, WIDTH, generator=generator)
-    gradient, rival_losses = (8 * torch.randn(2, n, HEIGHT, WIDTH, generator=generator) for n in (5, 2))
-    view = View(batch.start, loss, gradient, camera_loss, rival_losses)
+    gradient = 8 * torch.randn(2, 5, HEIGHT, WIDTH, generator=generator)
+    view = View(batch.start, loss, gradient, camera_loss)
     plain = look(config, Grid(config.divisor), view, batch)
     with torch.no_grad():
         seen = look(config, Grid(config.divisor), view, batch)
@@ -263,31 +247,6 @@ def test_the_contrasts_kernel_does_what_is_written_plainly():
     plain = Neighbours((1, 3)).contrasts(image)
     with torch.no_grad():
         torch.testing.assert_close(Neighbours((1, 3)).contrasts(image), plain)
-
-
-def test_a_rival_is_weighed_by_its_energies(batch: Batch):
-    """Its disparities and its motion apart; without it the refiner says what is missing."""
-    refiner = shaken(Refiner(SMALL_RIVAL))
-    generator = torch.Generator().manual_seed(8)
-    rival = batch.start + torch.randn(batch.start.shape, generator=generator)
-    batch = dataclasses.replace(batch, rival=rival)
-    oracle = Oracle(*batch.frames, batch.backward_flow)
-    seen = []
-
-    class Watching:
-        def features(self, state: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-            seen.append(state)
-            return oracle.features(state)
-
-    first = refine(refiner, batch, Watching(), 1).states[1]
-    disparities, motion = (torch.cat([a[:, :2], b[:, 2:]], 1) for a, b in ((rival, batch.start), (batch.start, rival)))
-    assert any(torch.equal(state, disparities) for state in seen)
-    assert any(torch.equal(state, motion) for state in seen)
-    with torch.no_grad():  # the inputs that tell of the rival, silenced
-        refiner.hidden[0].weight[:, SMALL.channels - 6 :] = 0
-    assert not torch.allclose(refine(refiner, batch, oracle, 1).states[1], first)
-    with pytest.raises(ValueError, match="rival"):
-        refine(refiner, dataclasses.replace(batch, rival=None))
 
 
 def test_the_cameras_energy_is_looked_at(batch: Batch):
@@ -337,8 +296,7 @@ def test_hybrid_is_networks_then_refiner(batch: Batch):
 
 
 @pytest.mark.parametrize("wrong", [{"inputs": ()}, {"inputs": ("state", "colour")}, {"inputs": ("state", "state")},
-                                   {"evidence": 2}, {"divisor": 0}, {"layers": ()}, {"neighbours": (0,)},
-                                   {"rival": True}])  # fmt: skip
+                                   {"evidence": 2}, {"divisor": 0}, {"layers": ()}, {"neighbours": (0,)}])  # fmt: skip
 def test_impossible_configurations_are_refused(wrong: dict):
     with pytest.raises(ValueError, match="must"):
         RefinerConfig(**wrong)
