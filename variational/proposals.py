@@ -56,19 +56,34 @@ def keep(start: Start) -> Proposal:
     return Proposal(start.state, np.full(shape, MEASURED, np.int32), [], np.zeros(shape, np.float32))
 
 
-def correspondences(start: Start, tolerance_px: float = 1.0) -> Correspondences:
-    """Where matched points of left1 went: flow that leads back within `tolerance_px` to points matched at both times."""
-    flow = flow_of(start.state)
+def round_trips(
+    flow: np.ndarray, backward_flow: np.ndarray, disparity1: np.ndarray, disparity2: np.ndarray, stride: int = 1,
+    tolerance_px: float = 1.0,
+) -> Correspondences:  # fmt: skip
+    """Where points of left1 went: flow that leads back within `tolerance_px`, with the disparities at both ends.
+
+    Flows are (H, W, 2), disparities (H, W), of left1 and of left2; every `stride`-th row and column is taken.
+    """
     height, width = flow.shape[:2]
-    x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+    flow, disparity1 = flow[::stride, ::stride], disparity1[::stride, ::stride]
+    y, x = np.mgrid[:height:stride, :width:stride].astype(np.float32)
     to_x, to_y = x + flow[..., 0], y + flow[..., 1]
     inside = (to_x >= 0) & (to_x <= width - 1) & (to_y >= 0) & (to_y <= height - 1)
-    left_over = flow + sample(start.backward_flow, flow)
-    there_and_back = cv2.magnitude(left_over[..., 0], left_over[..., 1])
+    back, second = (
+        cv2.remap(plane, to_x, to_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for plane in (backward_flow, disparity2)
+    )
+    there_and_back = cv2.magnitude(flow[..., 0] + back[..., 0], flow[..., 1] + back[..., 1])
+    return Correspondences(
+        np.dstack([x, y, disparity1]), np.dstack([to_x, to_y, second]), inside & (there_and_back < tolerance_px)
+    )
+
+
+def correspondences(start: Start) -> Correspondences:
+    """Round trips between points that are matched at both times."""
+    flow = flow_of(start.state)
+    trips = round_trips(flow, start.backward_flow, start.state[D1], start.match2.disparity)
     matched2 = sample(start.match2.matched.astype(np.float32), flow) > 0.99
-    valid = inside & (there_and_back < tolerance_px) & start.match1.matched & matched2
-    second_disparity = sample(start.match2.disparity, flow)
-    return Correspondences(np.dstack([x, y, start.state[D1]]), np.dstack([to_x, to_y, second_disparity]), valid)
+    return replace(trips, valid=trips.valid & start.match1.matched & matched2)
 
 
 def _nearby(motions: list[RigidMotion], slots: int) -> np.ndarray:
