@@ -53,19 +53,23 @@ def table(curves: Mapping[tuple[str, str], Scores]) -> str:
 
 
 def picture(curves: Mapping[tuple[str, str], Scores]) -> bytes:
-    """The same as a PNG: one line for each group and method."""
+    """The same as a PNG: a panel for each method, a line in it for each group."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(6.4, 4.2), layout="constrained")
-    axes = figure.add_subplot()
-    methods = {method for _, method in curves}
-    for (group, method), scores in curves.items():
-        values = scores.values()
-        label = group if len(methods) == 1 else f"{group}, {method}"
-        axes.plot(DROPPED, [values[str(dropped)] for dropped in DROPPED], marker="o", markersize=4, label=label)
-    axes.set(xlabel="least confident pixels dropped, %", ylabel="outliers among the others, SF in %", ylim=(0, None))
-    axes.grid(alpha=0.3)
-    axes.legend(frameon=False)
+    groups, methods = (list(dict.fromkeys(names)) for names in zip(*curves, strict=True))
+    figure = Figure(figsize=(2.2 + 3.6 * len(methods), 3.8), layout="constrained")
+    panels = figure.subplots(1, len(methods), sharey=True, squeeze=False)[0]
+    for axes, method in zip(panels, methods, strict=True):
+        for index, group in enumerate(groups):
+            if (group, method) in curves:
+                values = curves[group, method].values()
+                shares = [values[str(dropped)] for dropped in DROPPED]
+                axes.plot(DROPPED, shares, color=f"C{index}", marker="o", markersize=4, label=group)
+        axes.set(title=method, xlabel="least confident pixels dropped, %", ylim=(0, None))
+        axes.grid(alpha=0.3)
+    panels[0].set_ylabel("outliers among the others, SF in %")
+    handles = {label: handle for axes in panels for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+    figure.legend(handles.values(), handles.keys(), loc="outside right center", frameon=False)
     out = io.BytesIO()
     figure.savefig(out, format="png", dpi=130)
     return out.getvalue()
