@@ -35,7 +35,7 @@ def hyperbolic_tangent(x: float) -> float:
 
 
 @lanes
-def logarithm(x: float) -> float:
+def logarithm(x: float) -> np.float32:
     """ln(x) in float32 for x in float32's normal range, to about 1e-7; infinity and NaN give NaN."""
     bits = np.float32(x).view(np.int32)
     exponent = np.int32(np.int32(bits - _ROOT_HALF) >> np.int32(23))
@@ -44,4 +44,4 @@ def logarithm(x: float) -> float:
     square = s * s
     c3, c5, c7, c9 = _INVERSES
     series = np.float32(2) * (s + s * square * (c3 + square * (c5 + square * (c7 + square * c9))))
-    return np.float32(exponent) * _LN_2 + series if x < np.float32(np.inf) else np.float32(np.nan)  # type: ignore[return-value]
+    return np.float32(exponent) * _LN_2 + series if x < np.float32(np.inf) else np.float32(np.nan)

@@ -162,5 +162,5 @@ class Refiner(nn.Module):
     def _heads(self, x: Tensor) -> tuple[Tensor, ...]:
         """Reliability, preference and gates, by one convolution."""
         heads = self.reliability, self.preference, self.gates
-        weight, bias = torch.cat([head.weight for head in heads]), torch.cat([head.bias for head in heads])  # type: ignore[misc]
+        weight, bias = (torch.cat([head.get_parameter(name) for head in heads]) for name in ("weight", "bias"))
         return F.conv2d(x, weight, bias).split([head.out_channels for head in heads], 1)
