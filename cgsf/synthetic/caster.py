@@ -21,6 +21,8 @@ from variational.jit import rowwise
 NEAR_M = 0.05
 #: A ray may miss a triangle's edge by this much relative to its inverse depth: none slips between two triangles.
 EDGE_SLACK = 1e-9
+#: The same in pixels, for the columns and rows that a triangle is tested on.
+EDGE_SLACK_PX = 1e-6
 #: Rays that are tested together; arrays of rays end with as many that meet nothing.
 LANES = 4
 
@@ -30,7 +32,7 @@ def setup_triangles(
     points: np.ndarray, pose: np.ndarray, culled: np.ndarray, intrinsics: np.ndarray, height: int, width: int,
     corners: np.ndarray, plane: np.ndarray, bounds: np.ndarray,
 ) -> None:  # fmt: skip
-    """Ray equations and pixel bounds of triangles.
+    """Ray equations and bounds of triangles.
 
     Parameters
     ----------
@@ -46,13 +48,13 @@ def setup_triangles(
         Camera coordinates in metres.
     plane : ndarray (N, 3, 3) float64, written
         ``b_i = plane[n, i, 0] x + plane[n, i, 1] y + plane[n, i, 2]``.
-    bounds : ndarray (N, 4) int32, written
-        First and last column, first and last row; an empty range for a triangle that no ray meets.
+    bounds : ndarray (N, 4) float64, written
+        Lowest and highest x, lowest and highest y in pixels; an empty range for a triangle that no ray meets.
     """
     fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
     m = pose
     for n in range(points.shape[0]):
-        bounds[n, 0], bounds[n, 1], bounds[n, 2], bounds[n, 3] = 0, -1, 0, -1
+        bounds[n, 0], bounds[n, 1], bounds[n, 2], bounds[n, 3] = 0.0, -1.0, 0.0, -1.0
         v = corners[n]
         for c in range(3):
             x, y, z = points[n, c, 0], points[n, c, 1], points[n, c, 2]
@@ -91,15 +93,12 @@ def setup_triangles(
             plane[n, i, 0] = r0 / fx
             plane[n, i, 1] = r1 / fy
             plane[n, i, 2] = r2 - r0 * cx / fx - r1 * cy / fy
-        bounds[n, 0] = math.floor(max(low_x, 0.0) + 0.5)
-        bounds[n, 1] = min(math.floor(min(high_x, width - 1.0) + 0.5), width - 1)
-        bounds[n, 2] = math.floor(max(low_y, 0.0) + 0.5)
-        bounds[n, 3] = min(math.floor(min(high_y, height - 1.0) + 0.5), height - 1)
+        bounds[n, 0], bounds[n, 1], bounds[n, 2], bounds[n, 3] = low_x, high_x, low_y, high_y
 
 
 @rowwise
 def cast(
-    plane: np.ndarray, bounds: np.ndarray, x: np.ndarray, y: np.ndarray, start: np.ndarray, width: int,
+    plane: np.ndarray, bounds: np.ndarray, x: np.ndarray, y: np.ndarray, start: np.ndarray, width: int, reach: float,
     inverse_depth: np.ndarray, hit: np.ndarray,
 ) -> None:  # fmt: skip
     """Nearest triangle along each ray.
@@ -112,6 +111,8 @@ def cast(
         Rays in pixels, sorted by the pixel that they fall in, then NaN.
     start : ndarray (height * width + 1,) int32
         Rays ``start[i] ... start[i + 1] - 1`` fall in pixel i, counted row by row.
+    reach : float
+        No ray lies farther than this many pixels from its pixel's column and row.
     inverse_depth : ndarray (R + LANES,) float64, written
         1 / Z in 1/m; 0 where nothing is met.
     hit : ndarray (R + LANES,) int32, written
@@ -119,27 +120,30 @@ def cast(
     """
     inverse_depth[:] = 0.0
     hit[:] = -1
+    height = (start.size - 1) // width
     for n in range(plane.shape[0]):
         if bounds[n, 1] < bounds[n, 0]:
             continue
+        left, right = math.ceil(max(bounds[n, 0] - reach, 0.0)), math.floor(min(bounds[n, 1] + reach, width - 1.0))
+        top, bottom = math.ceil(max(bounds[n, 2] - reach, 0.0)), math.floor(min(bounds[n, 3] + reach, height - 1.0))
         p00, p01, p02 = plane[n, 0, 0], plane[n, 0, 1], plane[n, 0, 2]
         p10, p11, p12 = plane[n, 1, 0], plane[n, 1, 1], plane[n, 1, 2]
         p20, p21, p22 = plane[n, 2, 0], plane[n, 2, 1], plane[n, 2, 2]
         s0, s1, s2 = -1.0 / p00, -1.0 / p10, -1.0 / p20
-        narrow = bounds[n, 1] - bounds[n, 0] < LANES
-        for row in range(bounds[n, 2], bounds[n, 3] + 1):
-            first, last = bounds[n, 0], bounds[n, 1]
+        narrow = right - left < LANES
+        for row in range(top, bottom + 1):
+            first, last = left, right
             if not narrow:  # columns of this row where all b can be positive
-                low, high = first - 0.5, last + 1.5
-                zero = s0 * (p01 * row + p02 + 0.5 * abs(p01))
-                low, high = max(low, zero - 0.5 if p00 > 0.0 else low), min(high, zero + 1.5 if p00 < 0.0 else high)
-                zero = s1 * (p11 * row + p12 + 0.5 * abs(p11))
-                low, high = max(low, zero - 0.5 if p10 > 0.0 else low), min(high, zero + 1.5 if p10 < 0.0 else high)
-                zero = s2 * (p21 * row + p22 + 0.5 * abs(p21))
-                low, high = max(low, zero - 0.5 if p20 > 0.0 else low), min(high, zero + 1.5 if p20 < 0.0 else high)
-                first, last = max(first, int(low)), min(last, int(high))
-                if last < first:
-                    continue
+                low, high = left - reach, right + reach
+                zero = s0 * (p01 * row + p02 + reach * abs(p01))
+                low, high = max(low, zero if p00 > 0.0 else low), min(high, zero if p00 < 0.0 else high)
+                zero = s1 * (p11 * row + p12 + reach * abs(p11))
+                low, high = max(low, zero if p10 > 0.0 else low), min(high, zero if p10 < 0.0 else high)
+                zero = s2 * (p21 * row + p22 + reach * abs(p21))
+                low, high = max(low, zero if p20 > 0.0 else low), min(high, zero if p20 < 0.0 else high)
+                first, last = max(first, math.ceil(low - reach)), min(last, math.floor(high + reach))
+            if last < first:
+                continue
             begin, end = start[row * width + first], start[row * width + last + 1]
             # Whole vectors and no branch: rays beyond the range cannot meet the triangle, or may as well.
             for k in range((end - begin + LANES - 1) // LANES * LANES):
@@ -207,6 +211,13 @@ def _sort_rays(
     return total
 
 
+@rowwise
+def _unsort(count: int, order: np.ndarray, values: np.ndarray, out: np.ndarray) -> None:
+    """Values of sorted rays back to the rays' own places."""
+    for k in range(count):
+        out[np.uint32(order[k])] = values[k]
+
+
 class Caster:
     """The triangles of one moment, ready to be met by one camera's rays.
 
@@ -229,7 +240,7 @@ class Caster:
     ) -> None:
         self.pose, self.intrinsics, self.height, self.width = pose, intrinsics, height, width
         self.corners, self.plane = np.empty_like(points), np.empty_like(points)
-        self.bounds = np.empty((len(points), 4), np.int32)
+        self.bounds = np.empty((len(points), 4))
         setup_triangles(points, pose, culled, intrinsics, height, width, self.corners, self.plane, self.bounds)
 
     def sight(self) -> np.ndarray:
@@ -238,9 +249,9 @@ class Caster:
         turn = self.pose[:3, :3]
         return np.stack([turn[0] / fx, turn[1] / fy, turn[2] - turn[0] * cx / fx - turn[1] * cy / fy, -self.pose[:3, 3] @ turn])
 
-    def _cast(self, x: np.ndarray, y: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _cast(self, x: np.ndarray, y: np.ndarray, start: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
         inverse_depth, hit = np.empty(x.size), np.empty(x.size, np.int32)
-        cast(self.plane, self.bounds, x, y, start, self.width, inverse_depth, hit)
+        cast(self.plane, self.bounds, x, y, start, self.width, reach + EDGE_SLACK_PX, inverse_depth, hit)
         return inverse_depth, hit
 
     def _rays(self, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -257,7 +268,7 @@ class Caster:
         hit : ndarray (H, W) int32
             Triangle, or -1.
         """
-        inverse_depth, hit = self._cast(*_grid_rays(self.height, self.width))
+        inverse_depth, hit = self._cast(*_grid_rays(self.height, self.width), 0.0)
         shape = (self.height, self.width)
         return inverse_depth[:-LANES].reshape(shape), hit[:-LANES].reshape(shape)
 
@@ -278,7 +289,7 @@ class Caster:
         """
         rays = self._rays(int(np.count_nonzero(edge)) * len(offsets))
         _edge_rays(edge, offsets, *rays)
-        return self._cast(*rays)[1][:-LANES]
+        return self._cast(*rays, float(np.abs(offsets).max()))[1][:-LANES]
 
     def nearest(self, place: np.ndarray) -> np.ndarray:
         """Inverse depth (...) of what rays at `place` (..., 2) px meet first; NaN outside the image."""
@@ -287,5 +298,5 @@ class Caster:
         order = np.empty(len(flat), np.int32)
         inside = _sort_rays(flat, self.height, self.width, np.empty(len(flat), np.int32), start, order, x, y)
         inverse_depth = np.full(len(flat), np.nan)
-        inverse_depth[order[:inside]] = self._cast(x, y, start)[0][:inside]
+        _unsort(inside, order, self._cast(x, y, start, 0.5)[0], inverse_depth)
         return inverse_depth.reshape(place.shape[:-1])

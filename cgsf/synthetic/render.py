@@ -173,12 +173,15 @@ def truth_of(renderer: Renderer, left1: View, right1: View, left2: View, right2:
     in_right2, inverse_depth_right2 = follow(left1, right2)
     visible_flow = seen(left2, in_left2, inverse_depth2)
     height, width = left1.hit.shape
-    flow = np.stack([in_left2[..., 0] - np.arange(width), in_left2[..., 1] - np.arange(height)[:, None]], -1)
-    objects = np.where(left1.hit >= 0, renderer.soup.objects[left1.hit], 0).astype(np.int32)
+    flow = np.empty((height, width, 2), np.float32)
+    np.subtract(in_left2[..., 0], np.arange(width), out=flow[..., 0], casting="same_kind")
+    np.subtract(in_left2[..., 1], np.arange(height)[:, None], out=flow[..., 1], casting="same_kind")
+    objects = renderer.soup.objects[left1.hit]
+    objects[left1.hit < 0] = 0
     return Truth(
         disparity1=(scale * left1.inverse_depth).astype(np.float32),
         disparity2=(scale * inverse_depth2).astype(np.float32),
-        flow=flow.astype(np.float32),
+        flow=flow,
         disparity_left2=(scale * left2.inverse_depth).astype(np.float32),
         visible_stereo=seen(right1, *follow(left1, right1)),
         visible_flow=visible_flow,

@@ -239,10 +239,11 @@ class Soup:
     objects : ndarray (N,) int32
     materials : ndarray of MATERIAL
     textures : list of Texture
-    places : list of ndarray (4, 4)
+    places : ndarray (P, 4, 4)
         Of every part: from its own coordinates to the world's at time 0.
-    motions : list of Motion or None
-        Of every part.
+    motions : list of Motion
+    motion : ndarray (P,) int64
+        Number of every part's motion; -1 for what stands still.
     """
 
     points: np.ndarray
@@ -255,8 +256,9 @@ class Soup:
     objects: np.ndarray
     materials: np.ndarray
     textures: list[Texture]
-    places: list[np.ndarray]
-    motions: list[Motion | None]
+    places: np.ndarray
+    motions: list[Motion]
+    motion: np.ndarray
 
     @classmethod
     def of(cls, scene: Scene) -> "Soup":
@@ -264,9 +266,11 @@ class Soup:
         parts = scene.parts
         counts = [len(part.mesh.points) for part in parts]
         of_part = np.repeat(np.arange(len(parts)), counts)
-        offsets = np.cumsum([0, *(part.mesh.surfaces for part in parts[:-1])])
+        offsets = np.cumsum([0, *(part.mesh.surfaces for part in parts[:-1])])[of_part]
         unique = {id(part.material): part.material for part in parts}
         place = {key: index for index, key in enumerate(unique)}
+        motions = {id(part.motion): part.motion for part in parts if part.motion is not None}
+        number = {key: index for index, key in enumerate(motions)}
         textures: dict[int, Texture] = {id(scene.sky.clouds): scene.sky.clouds}
         for material in unique.values():
             for texture in (material.texture, material.detail):
@@ -277,7 +281,7 @@ class Soup:
         records = np.zeros(len(materials), MATERIAL)
         records["texture"] = [slot[id(material.texture)] for material in materials]
         records["detail"] = [slot[id(material.detail or material.texture)] for material in materials]
-        records["color"] = [material.color for material in materials]
+        records["color"] = np.concatenate([material.color for material in materials]).reshape(-1, 3, 4)
         turn, scale = np.array([(material.turn, material.scale) for material in materials]).T
         records["uv"][:, 0, 0] = records["uv"][:, 1, 1] = np.cos(turn) * scale
         records["uv"][:, 1, 0] = np.sin(turn) * scale
@@ -290,30 +294,28 @@ class Soup:
             np.concatenate([part.mesh.points for part in parts]),
             np.concatenate([part.mesh.normals for part in parts]),
             np.concatenate([part.mesh.uv for part in parts]),
-            np.concatenate([part.mesh.surface + offset for part, offset in zip(parts, offsets, strict=True)]),
+            np.concatenate([part.mesh.surface for part in parts]) + offsets,
             of_part,
             np.array([place[id(part.material)] for part in parts])[of_part],
             np.array([part.mesh.closed for part in parts])[of_part],
             np.array([part.object_id for part in parts], np.int32)[of_part],
             records,
             list(textures.values()),
-            [part.place for part in parts],
-            [part.motion for part in parts],
+            np.concatenate([part.place for part in parts]).reshape(-1, 4, 4),
+            list(motions.values()),
+            np.array([number.get(id(part.motion), -1) for part in parts]),
         )
 
     @property
     def moving(self) -> np.ndarray:
         """Numbers of the triangles that are not always at the same place, (M,) int64."""
-        return np.flatnonzero(np.array([motion is not None for motion in self.motions])[self.part])
+        return np.flatnonzero((self.motion >= 0)[self.part])
 
     def at(self, time: float, which: np.ndarray, points: np.ndarray, normals: np.ndarray) -> None:
         """Write the corners and normals of the triangles `which` (M,) at `time` in world coordinates, (N, 3, 3) each."""
-        motions = {id(motion): motion for motion in self.motions if motion is not None}
-        poses = dict(zip(motions, Motion.poses(list(motions.values()), time), strict=True))
-        places = np.stack([
-            place if motion is None else poses[id(motion)] @ place
-            for place, motion in zip(self.places, self.motions, strict=True)
-        ])  # fmt: skip
+        moves = self.motion >= 0
+        places = self.places.copy()
+        places[moves] = Motion.poses(self.motions, time)[self.motion[moves]] @ places[moves]
         _place(which, self.points, self.normals, self.part, places, points, normals)
 
 
