@@ -6,14 +6,14 @@ from pathlib import Path
 
 import click
 
+from cgsf.commands.options import dataset_options, parse_options
+
 
 @click.command()
 @click.argument("name")
 @click.argument("root", type=click.Path(path_type=Path))
 @click.option("--limit", type=click.IntRange(1), help="Check at most so many samples, evenly spread.")
-@click.option(
-    "--option", "options", multiple=True, metavar="KEY=VALUE", help="Option of the data set, for example split=test."
-)
+@dataset_options
 def command(name: str, root: Path, limit: int | None, options: tuple[str, ...]) -> None:
     """Check signs, units and pairing of data set NAME in ROOT: its truth must warp its images onto each other.
 
@@ -24,12 +24,8 @@ def command(name: str, root: Path, limit: int | None, options: tuple[str, ...]) 
 
     from cgsf.datasets import open_dataset
     from cgsf.datasets.check import check_sample
-    from cgsf.errors import InputError
 
-    broken = [option for option in options if "=" not in option]
-    if broken:
-        raise InputError(f"--option takes KEY=VALUE, got {broken[0]!r}")
-    dataset = open_dataset(name, root, **dict(option.split("=", 1) for option in options))
+    dataset = open_dataset(name, root, **parse_options(options))
     chosen = np.unique(np.linspace(0, len(dataset) - 1, min(limit or len(dataset), len(dataset))).round().astype(int))
     suspects, residuals = 0, dict[str, list[float]]()
     for index in tqdm(chosen, unit="sample", disable=None):

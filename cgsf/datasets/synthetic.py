@@ -45,6 +45,10 @@ class Synthetic:
         frames: int = 2,
         **options: Any,
     ) -> None:
+        whole = {"count": count, "seed": seed, "height": height, "width": width, "frames": frames}
+        for name, value in whole.items():
+            if not isinstance(value, int):
+                raise InputError(f"{name} must be a whole number, got {value!r}")
         if count < 1 or frames < 2:
             raise InputError(f"count must be at least 1 and frames at least 2, got {count} and {frames}")
         self.family, self.seeds, self.size, self.options = family, range(seed, seed + count), (height, width), options

@@ -57,6 +57,9 @@ class RenderConfig:
     shutter_steps: int = 5
 
     def __post_init__(self) -> None:
+        for name in ("photo_share", "gloss", "shutter", "shutter_steps"):
+            if not isinstance(getattr(self, name), int | float):
+                raise InputError(f"{name} must be a number, got {getattr(self, name)!r}")
         if not 0 <= self.shutter < 1:
             raise InputError(f"shutter must be in [0, 1), got {self.shutter}")
         if not 0 <= self.photo_share <= 1:

@@ -129,3 +129,15 @@ def test_commands_synthesize_and_check(tmp_path: Path) -> None:
     assert "flow" in bad.output
     refused = run(main, ["synthesize", "-o", str(tmp_path), "--family", "street", "--family", "things"])
     assert refused.exit_code == 2
+
+
+def test_check_dataset_takes_the_options_of_rendered_samples() -> None:
+    run = CliRunner().invoke
+    size = ["--option", "height=64", "--option", "width=200"]
+    good = run(main, ["check-dataset", "synthetic-street", ".", "--option", "count=2", *size])
+    assert good.exit_code == 0, good.output
+    assert "2 samples checked, 0 suspect" in good.output
+    for option, message in (("count=two", "count must be a whole number"), ("gloss=high", "gloss must be a number")):
+        refused = run(main, ["check-dataset", "synthetic-street", ".", *size, "--option", "count=1", "--option", option])
+        assert refused.exit_code == 2
+        assert message in refused.output
