@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from learned.bfloat16 import to_array
 from learned.correlation import disparity_correlation
 from learned.guided_aggregation import local_aggregation, semi_global_aggregation
+from learned.soft_argmin import enlarged, expectation, softmin
 from learned.threads import over_tasks
 from learned.transposed import DoublingConvolution3d
 from learned.upsampling_kernels import convex_upsampling as upsampling_kernel
@@ -303,26 +304,17 @@ class _Aggregation(nn.Module):
         cost = cost.squeeze(1).to(torch.promote_types(cost.dtype, torch.float32))
         reduction = self.config.reduction
         if self.config.full_resolution_head:
-            size = (self.config.max_disparity + 1, cost.shape[2] * reduction, cost.shape[3] * reduction)
-            cost = F.interpolate(cost[:, None], size, mode="trilinear", align_corners=False)[:, 0]
+            cost = enlarged(cost, (self.config.max_disparity + 1, cost.shape[2] * reduction, cost.shape[3] * reduction))
             if not guidance:
-                return _expectation(F.softmin(cost, 1))
-            probability = F.softmin(local_aggregation(cost, guidance[0]), 1)
-            probability = local_aggregation(probability, guidance[1])
-            return _expectation(probability) / probability.abs().sum(1).clamp(min=1e-12)
+                return expectation(softmin(cost))
+            probability = local_aggregation(softmin(local_aggregation(cost, guidance[0])), guidance[1])
+            return expectation(probability) / torch.linalg.vector_norm(probability, 1, dim=1).clamp(min=1e-12)
         if guidance:
             cost = local_aggregation(cost, guidance[0])
-        disparity = _expectation(F.softmin(cost, 1)) * reduction
+        disparity = expectation(softmin(cost)) * reduction
         if guidance:
             return convex_upsampling(disparity, guidance[1], reduction)
         return F.interpolate(disparity[:, None], scale_factor=reduction, mode="bilinear", align_corners=False)[:, 0]
-
-
-def _expectation(probability: Tensor) -> Tensor:
-    """sum_d d p(d) for p (B, D, H, W)."""
-    disparities = torch.arange(probability.shape[1], dtype=probability.dtype, device=probability.device)
-    with torch.autocast(probability.device.type, enabled=False):  # 100 px in bfloat16 are known to a quarter of a pixel
-        return torch.einsum("bdhw,d->bhw", probability, disparities)
 
 
 def convex_upsampling(disparity: Tensor, guidance: Tensor, factor: int) -> Tensor:
@@ -352,7 +344,19 @@ class _AggregationBlock(nn.Module):
         self.refine = _convolution(channels, channels, dims=3, relu=False)
 
     def forward(self, x: Tensor, guidance: Tensor) -> Tensor:
-        return F.relu_(self.refine(F.relu_(self.norm(semi_global_aggregation(x, guidance)))).add_(x))
+        if self.training:
+            aggregated = F.relu_(self.norm(semi_global_aggregation(x, guidance)))
+        else:
+            aggregated = semi_global_aggregation(x, guidance, _scale_and_shift(self.norm))
+        return F.relu_(self.refine(aggregated).add_(x))
+
+
+def _scale_and_shift(norm: nn.BatchNorm3d) -> tuple[Tensor, Tensor]:
+    """What batch normalisation does in evaluation, a channel at a time."""
+    assert norm.running_mean is not None
+    assert norm.running_var is not None
+    scale = norm.weight * torch.rsqrt(norm.running_var + norm.eps)
+    return scale, norm.bias - norm.running_mean * scale
 
 
 class _Join(nn.Module):

@@ -16,7 +16,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from learned.bfloat16 import to_array
-from learned.local_kernels import local_backward, local_forward
+from learned.local_kernels import local_backward, local_forward, local_tasks, local_weights
 from learned.semi_global_kernels import semi_global_backward, semi_global_forward
 from learned.threads import over_tasks
 
@@ -24,7 +24,7 @@ DIRECTIONS = ("down", "up", "right", "left")
 TERMS = 5
 
 
-def semi_global_aggregation(cost: Tensor, guidance: Tensor) -> Tensor:
+def semi_global_aggregation(cost: Tensor, guidance: Tensor, scale_and_shift: tuple[Tensor, Tensor] | None = None) -> Tensor:
     """Aggregate costs along four directions with a weight set for every pixel, channel and direction.
 
     Along direction r: ``A(p, d) = w0 C(p, d) + w1 A(p-r, d) + w2 A(p-r, d-1) + w3 A(p-r, d+1) + w4 max_i A(p-r, i)``.
@@ -36,6 +36,8 @@ def semi_global_aggregation(cost: Tensor, guidance: Tensor) -> Tensor:
     cost : Tensor (B, C, D, H, W)
     guidance : Tensor (B, 4 * 5 * C, H, W)
         Raw weights, direction outermost (down, up, right, left), then the five terms, then channels.
+    scale_and_shift : two Tensor (C,), optional
+        The result of every channel is then scaled, shifted and rectified: batch normalisation in evaluation.
 
     Returns
     -------
@@ -46,9 +48,15 @@ def semi_global_aggregation(cost: Tensor, guidance: Tensor) -> Tensor:
     if guidance.shape != (batch, len(DIRECTIONS) * TERMS * channels, height, width):
         raise ValueError(f"guidance of shape {tuple(guidance.shape)} does not fit costs of shape {tuple(cost.shape)}")
     if cost.device.type == "cpu" and {cost.dtype, guidance.dtype} <= {torch.float32, torch.bfloat16}:
+        if scale_and_shift is not None and not torch.is_grad_enabled():
+            return _swept(cost, guidance, torch.stack(scale_and_shift).float(), False)[0]
         aggregated: Tensor = _SemiGlobal.apply(cost, guidance)  # the recursion is in float32
+    else:
+        aggregated = semi_global_aggregation_reference(cost, guidance)
+    if scale_and_shift is None:
         return aggregated
-    return semi_global_aggregation_reference(cost, guidance)
+    scale, shift = (each.view(-1, 1, 1, 1) for each in scale_and_shift)
+    return F.relu(aggregated * scale + shift).to(cost.dtype)
 
 
 def semi_global_aggregation_reference(cost: Tensor, guidance: Tensor) -> Tensor:
@@ -78,17 +86,22 @@ def _sweep(cost: Tensor, weights: Tensor, axis: int, backwards: bool) -> Tensor:
     return torch.stack(aggregated[::-1] if backwards else aggregated, axis)
 
 
+def _swept(cost: Tensor, guidance: Tensor, scale_and_shift: Tensor, wanted: bool) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The result, and what the backward pass needs if it is wanted: costs, weights and which of the directions won."""
+    planes, weights = _planes(cost, wanted), _weights(guidance, wanted)
+    out = _large(planes.shape, planes.dtype)
+    chosen = torch.empty(planes.shape if wanted else (0, 0, 0), dtype=torch.uint8)
+    semi_global_forward(*(to_array(each.detach()) for each in (planes, weights, out, chosen, scale_and_shift)))
+    return _volume(out, cost), planes, weights, chosen
+
+
 class _SemiGlobal(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, cost: Tensor, guidance: Tensor) -> Tensor:
         wanted = any(ctx.needs_input_grad)
-        planes, weights = _planes(cost, wanted), _weights(guidance, wanted)
-        out = _large(planes.shape, planes.dtype)
-        # which of the four directions won: only the backward pass asks
-        chosen = torch.empty(planes.shape if wanted else (0, 0, 0), dtype=torch.uint8)
-        semi_global_forward(*(to_array(each) for each in (planes, weights, out, chosen)))
-        ctx.save_for_backward(planes, weights, chosen)
-        return _volume(out, cost)
+        out, *kept = _swept(cost, guidance, torch.empty((2, 0)), wanted)
+        ctx.save_for_backward(*kept)
+        return out
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor]:
@@ -145,6 +158,11 @@ def local_aggregation(cost: Tensor, guidance: Tensor, times: int = 2) -> Tensor:
         raise ValueError(f"guidance of shape {tuple(guidance.shape)} does not fit costs of shape {tuple(cost.shape)}")
     dtype = cost.dtype
     if cost.device.type == "cpu" and dtype in (torch.float32, torch.bfloat16):
+        if not torch.is_grad_enabled():
+            kernel, cost = _kernel_of(guidance), cost.float()
+            for _ in range(times):
+                cost = _filtered(cost, kernel)
+            return cost.to(dtype)
         weights = F.normalize(guidance.float().contiguous(), p=1, dim=1)
         for _ in range(times):
             cost = _Local.apply(cost.float(), weights)
@@ -168,15 +186,28 @@ def local_aggregation_reference(cost: Tensor, guidance: Tensor, times: int = 2) 
     return cost
 
 
+def _kernel_of(guidance: Tensor) -> Tensor:
+    """Weights (B, 75, H, W), raw or normalised, as ``local_forward`` wants them: (B, H, W, 75)."""
+    innermost = guidance.detach().movedim(1, -1).contiguous()
+    kernel = torch.empty(innermost.shape)
+    over_tasks(local_weights, innermost.shape[0] * innermost.shape[1], to_array(innermost), kernel.numpy())
+    return kernel
+
+
+def _filtered(cost: Tensor, kernel: Tensor) -> Tensor:
+    """(B, D, H, W) filtered once; disparities come out innermost."""
+    innermost = cost.movedim(1, -1).contiguous()
+    out = torch.empty_like(innermost)
+    over_tasks(local_forward, local_tasks(*innermost.shape[:3]), innermost.numpy(), kernel.numpy(), out.numpy())
+    return out.movedim(-1, 1)
+
+
 class _Local(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, cost: Tensor, weights: Tensor) -> Tensor:
         cost, weights = cost.detach().contiguous(), weights.detach().contiguous()
         ctx.save_for_backward(cost, weights)
-        out = torch.empty_like(cost)
-        rows = cost.shape[0] * cost.shape[2]
-        over_tasks(local_forward, rows, cost.numpy(), weights.numpy(), out.numpy())
-        return out
+        return _filtered(cost, _kernel_of(weights))
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor]:

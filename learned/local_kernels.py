@@ -1,86 +1,104 @@
-"""CPU kernels of local aggregation: float32, C-contiguous, forward and backward.
+"""CPU kernels of local aggregation, forward and backward: float32, C-contiguous.
 
-The 75 taps are 3 disparities x 5 rows x 5 columns. A tap that falls outside the volume takes the centre's value, so the
-border has loops of its own, and the inside has none of their questions.
+The 75 taps are 3 disparities x 5 rows x 5 columns. A tap that falls outside the volume takes the centre's value. Forward,
+disparities are innermost: the lanes of the vector registers, with the same weights for all of them. What a neighbour gives
+to its own disparity, the next and the one before is summed apart, and the three sums are joined at the end.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
+from learned.bfloat16 import widen
 from learned.jit import lanes, tasks
 
-# Disparities that share the loads of their weights.
-_ROWS = 4
+# Columns and rows of a task: five rows of so many columns stay in the second cache.
+_COLUMNS, _BAND = 64, 32
+_CENTRE = 37  # the tap
+_EPSILON = np.float32(1e-12)
+
+
+@tasks
+def local_weights(first: int, last: int, guidance: np.ndarray, out: np.ndarray) -> None:
+    """Raw weights (B, H, W, 75), float32 or uint16, divided by their L1 norms, to float32.
+
+    Those of taps beyond the sides of the image go to the centre. The tasks are the rows of all B together.
+    """
+    _, height, width, _ = guidance.shape
+    for task in range(first, last):
+        b, y = task // height, task % height
+        for x in range(width):
+            pixel, own = guidance[b, y, x], out[b, y, x]
+            norm = np.float32(0)
+            for tap in range(75):
+                norm += abs(widen(pixel[tap]))
+            _scale(pixel, np.float32(1) / max(norm, _EPSILON), own)
+            if not (2 <= y < height - 2 and 2 <= x < width - 2):
+                for tap in range(75):
+                    if not (0 <= y + tap // 5 % 5 - 2 < height and 0 <= x + tap % 5 - 2 < width):
+                        own[_CENTRE] += own[tap]
+                        own[tap] = 0
+
+
+def local_tasks(batch: int, height: int, width: int) -> int:
+    """How many tasks ``local_forward`` has."""
+    return batch * -(-width // _COLUMNS) * -(-height // _BAND)
 
 
 @tasks
 def local_forward(first: int, last: int, cost: np.ndarray, weights: np.ndarray, out: np.ndarray) -> None:
-    """out(d, y, x) = sum over the 75 taps of weight(tap, y, x) cost(d + dd, y + dy, x + dx), the centre where outside.
+    """out(y, x, d) = sum over the 75 taps of weight(y, x, tap) cost(y + dy, x + dx, d + dd), the centre where outside.
 
-    Shapes (B, D, H, W), (B, 75, H, W), (B, D, H, W); the tasks are the rows of all B together.
+    ``cost`` and ``out`` (B, H, W, D), ``weights`` (B, H, W, 75) of ``local_weights``.
     """
-    _, depth, height, width = cost.shape
+    _, height, width, depth = cost.shape
+    strips, bands = (width + _COLUMNS - 1) // _COLUMNS, (height + _BAND - 1) // _BAND
+    below, same, above = np.empty(depth, np.float32), np.empty(depth, np.float32), np.empty(depth, np.float32)
     for task in range(first, last):
-        b, y = task // height, task % height
-        inside = 2 <= y < height - 2 and width > 4
-        # disparities from 1 on that are worked on together
-        end = 1 + max(0, depth - 2) // _ROWS * _ROWS if inside else 1
-        for d in range(1, end, _ROWS):
-            out[b, d : d + _ROWS, y] = 0
-            for dy in range(5):
-                _four_disparities(cost, weights, b, d, y, dy, out)
-            for k in range(d, d + _ROWS):
-                for x in (0, 1, width - 2, width - 1):
-                    out[b, k, y, x] = _pixel(cost, weights, b, k, y, x)
-        _border_row(cost, weights, b, 0, y, out)
-        for d in range(end, depth):
-            _border_row(cost, weights, b, d, y, out)
+        b, left, top = task // (strips * bands), task // bands % strips * _COLUMNS, task % bands * _BAND
+        for y in range(top, min(top + _BAND, height)):
+            for x in range(left, min(left + _COLUMNS, width)):
+                own, centre, total = weights[b, y, x], cost[b, y, x], out[b, y, x]
+                below[:], same[:], above[:] = 0, 0, 0
+                # beyond the sides of the image weights are zero, whatever they are multiplied with
+                x0, x1, x3, x4 = max(x - 2, 0), max(x - 1, 0), min(x + 1, width - 1), min(x + 2, width - 1)
+                for dy in range(5):
+                    row = cost[b, min(max(y + dy - 2, 0), height - 1)]
+                    _add_row(row[x0], row[x1], row[x], row[x3], row[x4], own[5 * dy :], below, same, above)
+                _join(below, same[1:], above[2:], total[1:])
+                beyond_below, beyond_above = np.float32(0), np.float32(0)
+                for tap in range(25):
+                    beyond_below += own[tap]
+                    beyond_above += own[tap + 50]
+                end = depth - 1
+                total[end] = same[end] + beyond_above * centre[end] + (below[end - 1] if end > 0 else beyond_below * centre[0])
+                if end > 0:
+                    total[0] = same[0] + beyond_below * centre[0] + above[1]
 
 
 @lanes
-def _four_disparities(cost: np.ndarray, weights: np.ndarray, b: int, d: int, y: int, dy: int, out: np.ndarray) -> None:
-    """Add row ``dy`` of the window at disparities d ... d + 3, except to the two outermost columns on either side."""
-    # unsigned: for a signed index numba asks whether it is negative, and nothing is vectorised
-    row, source = np.uint64(y), np.uint64(y + dy - 2)
-    for x in range(2, cost.shape[3] - 2):
-        at = np.uint64(x)
-        t0, t1, t2, t3 = out[b, d, row, at], out[b, d + 1, row, at], out[b, d + 2, row, at], out[b, d + 3, row, at]
-        for dx in range(5):
-            tap, there = dy * 5 + dx, np.uint64(x + dx - 2)
-            below, same, above = weights[b, tap, row, at], weights[b, tap + 25, row, at], weights[b, tap + 50, row, at]
-            c0, c1, c2 = cost[b, d - 1, source, there], cost[b, d, source, there], cost[b, d + 1, source, there]
-            c3, c4, c5 = cost[b, d + 2, source, there], cost[b, d + 3, source, there], cost[b, d + 4, source, there]
-            t0 += below * c0 + same * c1 + above * c2
-            t1 += below * c1 + same * c2 + above * c3
-            t2 += below * c2 + same * c3 + above * c4
-            t3 += below * c3 + same * c4 + above * c5
-        out[b, d, row, at], out[b, d + 1, row, at], out[b, d + 2, row, at], out[b, d + 3, row, at] = t0, t1, t2, t3
-
-
-@lanes
-def _pixel(cost: np.ndarray, weights: np.ndarray, b: int, d: int, y: int, x: int) -> np.float32:
-    _, depth, height, width = cost.shape
-    total = np.float32(0)
+def _scale(pixel: np.ndarray, scale: np.float32, out: np.ndarray) -> None:
     for tap in range(75):
-        dd, yy, xx = d + tap // 25 - 1, y + tap // 5 % 5 - 2, x + tap % 5 - 2
-        inside = 0 <= dd < depth and 0 <= yy < height and 0 <= xx < width
-        total += weights[b, tap, y, x] * (cost[b, dd, yy, xx] if inside else cost[b, d, y, x])
-    return total
+        out[tap] = widen(pixel[tap]) * scale
 
 
 @lanes
-def _border_row(cost: np.ndarray, weights: np.ndarray, b: int, d: int, y: int, out: np.ndarray) -> None:
-    _, depth, height, width = cost.shape
-    out[b, d, y] = 0
-    for tap in range(75):
-        dd, yy, dx = d + tap // 25 - 1, y + tap // 5 % 5 - 2, tap % 5 - 2
-        begin, end = _inside(dx, width) if 0 <= dd < depth and 0 <= yy < height else (width, width)
-        weight, centre, total = weights[b, tap, y], cost[b, d, y], out[b, d, y]
-        if begin < end:
-            _multiply_add(weight[begin:end], cost[b, dd, yy, begin + dx :], total[begin:])
-        _multiply_add(weight[:begin], centre, total)
-        _multiply_add(weight[end:], centre[end:], total[end:])
+def _add_row(c0: np.ndarray, c1: np.ndarray, c2: np.ndarray, c3: np.ndarray, c4: np.ndarray, w: np.ndarray,
+             below: np.ndarray, same: np.ndarray, above: np.ndarray) -> None:
+    """What five pixels of a row give to the disparity above each of theirs (``below`` it they are), to it and to that below."""
+    b0, b1, b2, b3, b4 = w[0], w[1], w[2], w[3], w[4]
+    s0, s1, s2, s3, s4 = w[25], w[26], w[27], w[28], w[29]
+    a0, a1, a2, a3, a4 = w[50], w[51], w[52], w[53], w[54]
+    for d in range(same.size):
+        below[d] += b0 * c0[d] + b1 * c1[d] + b2 * c2[d] + b3 * c3[d] + b4 * c4[d]
+        same[d] += s0 * c0[d] + s1 * c1[d] + s2 * c2[d] + s3 * c3[d] + s4 * c4[d]
+        above[d] += a0 * c0[d] + a1 * c1[d] + a2 * c2[d] + a3 * c3[d] + a4 * c4[d]
+
+
+@lanes
+def _join(below: np.ndarray, same: np.ndarray, above: np.ndarray, total: np.ndarray) -> None:
+    for d in range(above.size):
+        total[d] = below[d] + same[d] + above[d]
 
 
 @tasks

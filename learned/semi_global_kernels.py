@@ -21,8 +21,9 @@ _ROWS = 4
 _EPSILON = np.float32(1e-12)
 
 
-def semi_global_forward(cost: np.ndarray, guidance: np.ndarray, out: np.ndarray, chosen: np.ndarray) -> None:
-    """Largest of the four directions.
+def semi_global_forward(cost: np.ndarray, guidance: np.ndarray, out: np.ndarray, chosen: np.ndarray,
+                        scale_and_shift: np.ndarray) -> None:
+    """Largest of the four directions; where asked for, scaled, shifted and rectified.
 
     Parameters
     ----------
@@ -33,16 +34,18 @@ def semi_global_forward(cost: np.ndarray, guidance: np.ndarray, out: np.ndarray,
         Written.
     chosen : like cost but uint8, or empty
         Written: the index of the direction that won (the first of equals).
+    scale_and_shift : (2, C) float32, or (2, 0)
     """
     batch, height, width, _, _, channels = guidance.shape
     columns = max(1, _RUN // channels)
-    over_tasks(_both_ways, batch * -(-width // columns), True, columns, cost, guidance, out, chosen)
-    over_tasks(_both_ways, batch * height, False, 1, cost, guidance, out, chosen)
+    arrays = cost, guidance, out, chosen, scale_and_shift
+    over_tasks(_both_ways, batch * -(-width // columns), True, columns, *arrays)
+    over_tasks(_both_ways, batch * height, False, 1, *arrays)
 
 
 @tasks
 def _both_ways(first: int, last: int, vertical: bool, bundle: int, cost: np.ndarray, guidance: np.ndarray, out: np.ndarray,
-               chosen: np.ndarray) -> None:
+               chosen: np.ndarray, scale_and_shift: np.ndarray) -> None:
     """Sweeps there and back of bundles of columns or of single rows; rows come last and keep what is larger already."""
     _, height, width, _, _, channels = guidance.shape
     depth = cost.shape[1]
@@ -78,8 +81,10 @@ def _both_ways(first: int, last: int, vertical: bool, bundle: int, cost: np.ndar
                 _choose(there[step], back[now], b, at, vertical, out, chosen)
             if vertical:
                 _keep_larger(there[step], back[now], b, at, out)
-            else:
+            elif scale_and_shift.size == 0:
                 _keep_largest(there[step], back[now], b, at, out)
+            else:
+                _keep_rectified(there[step], back[now], b, at, scale_and_shift, out)
 
 
 def semi_global_backward(cost: np.ndarray, guidance: np.ndarray, chosen: np.ndarray, gradient: np.ndarray,
@@ -269,6 +274,18 @@ def _keep_largest(one: np.ndarray, other: np.ndarray, b: int, at: int, out: np.n
             present = out[b, d, first + np.uint64(v)]
             larger = other[d + 1, v] if other[d + 1, v] > one[d + 1, v] else one[d + 1, v]
             out[b, d, first + np.uint64(v)] = narrow(larger, out) if larger > widen(present) else present
+
+
+@lanes
+def _keep_rectified(one: np.ndarray, other: np.ndarray, b: int, at: int, scale_and_shift: np.ndarray, out: np.ndarray) -> None:
+    """Of all three too; the one bundle is a single pixel: its lanes are the channels."""
+    first = np.uint64(at)
+    for d in range(one.shape[0] - 2):
+        for v in range(one.shape[1]):
+            present = widen(out[b, d, first + np.uint64(v)])
+            larger = other[d + 1, v] if other[d + 1, v] > one[d + 1, v] else one[d + 1, v]
+            value = (larger if larger > present else present) * scale_and_shift[0, v] + scale_and_shift[1, v]
+            out[b, d, first + np.uint64(v)] = narrow(value if value > 0 else np.float32(0), out)
 
 
 @lanes

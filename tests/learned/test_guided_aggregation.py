@@ -120,3 +120,24 @@ def test_guidance_of_another_size_is_refused(operator):
     cost, guidance = _inputs(operator, 1, 3, 4, 5, 6)
     with pytest.raises(ValueError, match="does not fit"):
         operator[0](cost, guidance[:, 1:])
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_sga_then_scaled_shifted_and_rectified(dtype):
+    cost, guidance = (maps.to(dtype) for maps in _inputs(SGA, 2, 5, 6, 7, 9))
+    scale, shift = torch.linspace(-1, 2, 5), torch.linspace(0.5, -0.5, 5)
+    plain = semi_global_aggregation(cost, guidance) * scale.view(-1, 1, 1, 1) + shift.view(-1, 1, 1, 1)
+    with torch.no_grad():
+        fused = semi_global_aggregation(cost, guidance, (scale, shift))
+    assert fused.dtype == dtype
+    tolerance = {"rtol": 1e-2, "atol": 1e-2} if dtype == torch.bfloat16 else {}
+    torch.testing.assert_close(fused, plain.relu().to(dtype), **tolerance)
+    with torch.enable_grad():
+        torch.testing.assert_close(semi_global_aggregation(cost, guidance, (scale, shift)), fused, **tolerance)
+
+
+@torch.no_grad()
+def test_lga_takes_strips_and_bands_of_any_size():
+    """More columns and rows than a task of the kernel has."""
+    cost, guidance = _inputs(LGA, 1, 1, 4, 35, 67)
+    torch.testing.assert_close(local_aggregation(cost, guidance), local_aggregation_reference(cost, guidance))
