@@ -14,6 +14,7 @@ import pytest
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
+from cgsf.threads import keep_freed_memory
 from learned import ganet, pwcnet
 from learned.feedforward import FeedforwardModule, fold_normalisation
 from learned.guided_aggregation import semi_global_aggregation, semi_global_aggregation_reference
@@ -32,6 +33,7 @@ def images(size, count):
 
 def network(build, config, dtype, passes):
     """A function of no arguments, warmed up at a small size: `passes` passes of a folded network."""
+    keep_freed_memory()  # as `cgsf run` does
     torch.manual_seed(3)
     net = fold_normalisation(build(config).eval())
 
@@ -46,6 +48,7 @@ def network(build, config, dtype, passes):
 
 
 def feedforward():
+    keep_freed_memory()
     torch.manual_seed(3)
     networks = (fold_normalisation(net.eval()) for net in (ganet.GANet(ganet.COMPACT), pwcnet.PWCNet(pwcnet.COMPACT)))
     module = FeedforwardModule(*networks, "bfloat16").eval()
