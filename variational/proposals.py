@@ -16,7 +16,6 @@ from variational.frames import Frames
 from variational.fusion import FusionConfig, choose, motion_costs
 from variational.initialise import Start, sample
 from variational.jit import over_rows, rowwise, side_by_side
-from variational.landmarks import LandmarksConfig, find_landmarks, find_marked_objects
 from variational.matching import MatchingConfig, StereoMatch
 from variational.objects import ObjectsConfig, find_objects, unexplained_surfaces
 from variational.planes import PlanesConfig, plane_disparities
@@ -141,7 +140,7 @@ def _take(
 
 def propose(
     start: Start, frames: Frames, camera: StereoCamera | None, matching: MatchingConfig, rigid: RigidConfig,
-    objects: ObjectsConfig, landmarks: LandmarksConfig, planes: PlanesConfig, fusion: FusionConfig, evidence: EvidenceConfig,
+    objects: ObjectsConfig, planes: PlanesConfig, fusion: FusionConfig, evidence: EvidenceConfig,
 ) -> Proposal:  # fmt: skip
     """Fuse the start with rigid motions.
 
@@ -157,7 +156,7 @@ def propose(
     Proposal
     """
 
-    grey, _, grey2, _ = frames.grey
+    grey = frames.grey[0]
 
     def search() -> tuple[StereoCamera, list[RigidMotion]]:
         matches = correspondences(start)
@@ -167,7 +166,7 @@ def propose(
     def fill_planes() -> StereoMatch:
         return _with_planes(start.match1, frames.left1, planes)
 
-    (known, motions), landmarks2, match1 = side_by_side(search, lambda: find_landmarks(grey2, landmarks), fill_planes)
+    (known, motions), match1 = side_by_side(search, fill_planes)
     if not motions:
         return keep(start)
     words = (start.match1.words_left, start.match2.words_left, start.match2.words_right)
@@ -194,8 +193,7 @@ def propose(
 
     def lost_objects() -> list[RigidMotion]:
         surfaces = unexplained_surfaces(state[D1], cost, project_visibility(state), start.match1.matched, objects)
-        marked = find_marked_objects(start, state[D1], grey, landmarks2, surfaces, known.projection(), landmarks)
-        return marked + find_objects(start, state[D1], grey, grey2, surfaces, known.projection(), objects)
+        return find_objects(start, state[D1], frames, surfaces, known.projection(), objects)
 
     homographies = np.stack([motion.homography for motion in motions])
     disparity, found = side_by_side(

@@ -178,7 +178,9 @@ def _project(points: np.ndarray, projection: np.ndarray) -> np.ndarray:
     return image[:, :3] / image[:, 3:]
 
 
-def fit_motion(first: np.ndarray, second: np.ndarray, projection: np.ndarray, iterations: int = 5) -> np.ndarray | None:
+def fit_motion(
+    first: np.ndarray, second: np.ndarray, projection: np.ndarray, tolerance_px: float = 1.0, iterations: int = 5
+) -> np.ndarray | None:
     """Rigid motion between two sets of points in image-and-disparity space.
 
     Parameters
@@ -187,6 +189,8 @@ def fit_motion(first: np.ndarray, second: np.ndarray, projection: np.ndarray, it
         (N, 3) float64, (x, y, disparity > 0), pixels.
     projection : np.ndarray
         (4, 4), StereoCamera.projection().
+    tolerance_px : float
+        How exactly the points are known.
     iterations : int
         Gauss-Newton steps after RANSAC.
 
@@ -200,7 +204,7 @@ def fit_motion(first: np.ndarray, second: np.ndarray, projection: np.ndarray, it
     try:
         found, rotation, translation, inliers = cv2.solvePnPRansac(
             points, np.ascontiguousarray(second[:, :2]), camera_matrix, None,
-            iterationsCount=200, reprojectionError=1.0, confidence=0.999, flags=cv2.SOLVEPNP_AP3P,
+            iterationsCount=200, reprojectionError=tolerance_px, confidence=0.999, flags=cv2.SOLVEPNP_AP3P,
         )  # fmt: skip
     except cv2.error:  # what OpenCV says of degenerate points
         return None
@@ -208,12 +212,12 @@ def fit_motion(first: np.ndarray, second: np.ndarray, projection: np.ndarray, it
         return None
     transform = np.eye(4)
     transform[:3, :3], transform[:3, 3] = cv2.Rodrigues(rotation)[0], translation[:, 0]
-    return _gauss_newton(transform, points, second, projection, iterations)
+    return _gauss_newton(transform, points, second, projection, iterations, 0.7 * tolerance_px)
 
 
 def _gauss_newton(
     transform: np.ndarray, points: np.ndarray, second: np.ndarray, projection: np.ndarray, iterations: int,
-    scale_px: float = 0.7,
+    scale_px: float,
 ) -> np.ndarray | None:  # fmt: skip
     """Minimise the Geman-McClure penalty of the distance in (x, y, disparity) over a twist from the left."""
     fx, fy, fb = projection[0, 0], projection[1, 1], projection[2, 3]
@@ -248,16 +252,17 @@ def _gauss_newton(
 
 
 def fit_surface(
-    surface: np.ndarray, first: np.ndarray, second: np.ndarray, projection: np.ndarray, share: float
+    surface: np.ndarray, first: np.ndarray, second: np.ndarray, projection: np.ndarray, least: float, tolerance_px: float = 1.0
 ) -> RigidMotion | None:
-    """The motion of a surface (H, W) bool, if at least a `share` of its points follow it within 2 px; else as `fit_motion`."""
-    transform = fit_motion(first, second, projection)
+    """The motion of a surface (H, W) bool, if at least so many of its points follow it within twice the tolerance; else as
+    `fit_motion`."""
+    transform = fit_motion(first, second, projection, tolerance_px)
     if transform is None:
         return None
     homography = projection @ transform @ np.linalg.inv(projection)
     moved = np.column_stack([first, np.ones(len(first))]) @ homography.T
     distance = np.linalg.norm(moved[:, :3] / moved[:, 3:] - second, axis=1)
-    return RigidMotion(transform, homography, surface) if np.mean(distance < 2.0) >= share else None
+    return RigidMotion(transform, homography, surface) if np.sum(distance < 2 * tolerance_px) >= least else None
 
 
 def _thin(valid: np.ndarray, count: int) -> np.ndarray:

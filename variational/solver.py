@@ -18,7 +18,6 @@ from variational.frames import Frames
 from variational.fusion import FusionConfig
 from variational.initialise import MIN_SIDE, StartName, initialise, sample
 from variational.jit import side_by_side
-from variational.landmarks import LandmarksConfig
 from variational.matching import MatchingConfig
 from variational.objects import ObjectsConfig
 from variational.planes import PlanesConfig
@@ -47,7 +46,7 @@ class SolverConfig:
         no such limit.
     proposals : bool
         Fuse the start with rigid motions (variational.proposals).
-    matching, rigid, objects, landmarks, planes, fusion, evidence, from_zero, refine, constancy
+    matching, rigid, objects, planes, fusion, evidence, from_zero, refine, constancy
         Settings of the parts.
     descent, energy
         First-order descent of the consistency energy after all else, and that energy; off unless descent.levels > 0.
@@ -59,7 +58,6 @@ class SolverConfig:
     matching: MatchingConfig = field(default_factory=MatchingConfig)
     rigid: RigidConfig = field(default_factory=RigidConfig)
     objects: ObjectsConfig = field(default_factory=ObjectsConfig)
-    landmarks: LandmarksConfig = field(default_factory=LandmarksConfig)
     planes: PlanesConfig = field(default_factory=PlanesConfig)
     fusion: FusionConfig = field(default_factory=FusionConfig)
     evidence: EvidenceConfig = field(default_factory=EvidenceConfig)
@@ -168,7 +166,7 @@ def solve(
     if config.proposals:
         with stage("proposals", 0.5):
             proposal = propose(
-                start, frames, camera, config.matching, config.rigid, config.objects, config.landmarks, config.planes,
+                start, frames, camera, config.matching, config.rigid, config.objects, config.planes,
                 config.fusion, config.evidence,
             )  # fmt: skip
     with stage("refine", 0.8):

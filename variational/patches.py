@@ -1,0 +1,238 @@
+"""Where patches of one image are seen again in another, however far they went, with neighbours that vote.
+
+For what dense flow lost: it follows small steps only. Patches of both images, made smaller, are compared by normalised
+correlation at every displacement within reach. A patch alone is often ambiguous, but its neighbours on the same surface
+move nearly as it does: their scores at nearly the same displacement are added to its own, which tolerates the rotation
+and the stretch that a whole template does not. A place is believed if the same search leads back from it. After
+Weinzaepfel et al. 2013, DeepFlow, doi:10.1109/ICCV.2013.175: one level of its matching, on scattered places.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from variational.jit import over_bands, over_rows, rowwise, scalar
+
+#: Below this norm a patch is noise on an even surface (about 2 grey values of 255 a pixel); such patches correlate with nothing.
+_NOISE = 0.02
+_LEAST_VOTE = 1e-3
+_BESIDE = 3  # displacements so near belong to one maximum
+_WIDE = 4  # numbers of a patch that are multiplied in one pass over a row of scores
+_STACK = 8
+"""Places whose scores are found by one thread before the next: the unit of work."""
+
+
+@dataclass(frozen=True)
+class PatchesConfig:
+    """Patches, and how far they are looked for.
+
+    Parameters
+    ----------
+    pixels : int
+        Images are made smaller to about so many pixels, which bounds the time.
+    radius : int
+        Patches have 2 radius + 1 pixels of the smaller image on a side.
+    reach : float
+        Largest displacement along x and y, as a share of the image's width.
+    votes : float
+        Weight of the neighbours' mean score beside a patch's own; 0 lets none vote.
+    neighbours : float
+        Standard deviation of the neighbours' distances, in pixels of the smaller image: farther ones count less.
+    return_px : float
+        A place is believed if the way back leads this near along x and y, in pixels of the smaller image.
+    ratio : float
+        A displacement is believed if all but those beside it score less than this share of its score: in a repeated pattern
+        others score as well, and the way back leads home from each of them. 1 believes all.
+    """
+
+    pixels: int = 16_000
+    radius: int = 3
+    reach: float = 0.15
+    votes: float = 2.0
+    neighbours: float = 5.0
+    return_px: float = 1.5
+    ratio: float = 0.9
+
+    def __post_init__(self) -> None:
+        if self.pixels < 1 or self.radius < 1:
+            raise ValueError("PatchesConfig needs pixels >= 1 and radius >= 1")
+
+
+@rowwise
+def _describe(first: int, last: int, padded: np.ndarray, radius: int, words: np.ndarray) -> None:
+    """words (h, n, w): the patch around each pixel less its mean in each channel; of unit norm, or less where it is even.
+
+    padded: (h + 2 radius, w + 2 radius, channels).
+    """
+    width, channels, side = words.shape[2], padded.shape[2], 2 * radius + 1
+    area = np.float32(side * side)
+    for y in range(first, last):
+        for x in range(width):
+            power = np.float32(0)
+            for c in range(channels):
+                mean = np.float32(0)
+                for i in range(side):
+                    for j in range(side):
+                        mean += padded[y + i, x + j, c]
+                mean /= area
+                for i in range(side):
+                    for j in range(side):
+                        value = padded[y + i, x + j, c] - mean
+                        words[y, (c * side + i) * side + j, x] = value
+                        power += value * value
+            scale = np.float32(1) / np.sqrt(power + np.float32(_NOISE * _NOISE) * area * np.float32(channels))
+            for k in range(words.shape[1]):
+                words[y, k, x] *= scale
+
+
+def describe(image: np.ndarray, shape: tuple[int, int], radius: int) -> np.ndarray:
+    """(h, n, w) float32 patches around the pixels of an image (H, W, channels) made smaller to `shape` (h, w), n filled up with
+    zeros to a multiple of four."""
+    small = cv2.resize(image, shape[::-1], interpolation=cv2.INTER_AREA)
+    small = cv2.GaussianBlur(small, (0, 0), 0.7).reshape(*shape, -1).astype(np.float32)  # OpenCV drops a single channel
+    padded = np.pad(small, ((radius, radius), (radius, radius), (0, 0)), mode="edge")
+    count = (2 * radius + 1) ** 2 * small.shape[2]
+    words = np.zeros((shape[0], count + -count % _WIDE, shape[1]), np.float32)
+    over_rows(_describe, shape[0], padded, radius, words)
+    return words
+
+
+@rowwise
+def _compare(
+    first: int, last: int, words1: np.ndarray, words2: np.ndarray, places: np.ndarray, reach: int, scores: np.ndarray,
+    pooled: np.ndarray,
+) -> None:  # fmt: skip
+    """scores (N, S + 2, S + 2) of the places (N, 2: x, y) at each displacement, S = 2 reach + 1, inside a border of zeros.
+
+    A score is the correlation to the power of 1.5, 0 if negative or outside: what agrees well counts for more.
+    pooled (N, S, S): their maximum over 3 x 3.
+    """
+    height, count, width = words2.shape
+    side, zero = 2 * reach + 1, np.float32(0)
+    for n in range(first, last):
+        x, y = places[n, 0], places[n, 1]
+        for i in range(side + 2):
+            for j in range(side + 2):
+                scores[n, i, j] = zero
+        begin, end = max(x - reach, 0), min(x + reach + 1, width)
+        # unsigned: numba gathers from an index that it cannot prove positive
+        at, start, size = np.uint64(begin - (x - reach) + 1), np.uint64(begin), np.uint64(max(end - begin, 0))
+        for to_y in range(max(y - reach, 0), min(y + reach + 1, height)):
+            i = to_y - (y - reach) + 1
+            for k in range(0, count, _WIDE):
+                a, b, c, d = words1[y, k, x], words1[y, k + 1, x], words1[y, k + 2, x], words1[y, k + 3, x]
+                for j in range(size):
+                    to_x = start + j
+                    one = a * words2[to_y, k, to_x] + b * words2[to_y, k + 1, to_x]
+                    scores[n, i, at + j] += one + (c * words2[to_y, k + 2, to_x] + d * words2[to_y, k + 3, to_x])
+            for j in range(1, side + 1):
+                positive = max(scores[n, i, j], zero)
+                scores[n, i, j] = positive * np.sqrt(positive)
+        for i in range(side):
+            for j in range(side):
+                above = max(scores[n, i, j], scores[n, i, j + 1], scores[n, i, j + 2])
+                middle = max(scores[n, i + 1, j], scores[n, i + 1, j + 1], scores[n, i + 1, j + 2])
+                below = max(scores[n, i + 2, j], scores[n, i + 2, j + 1], scores[n, i + 2, j + 2])
+                pooled[n, i, j] = max(above, middle, below)
+
+
+@rowwise
+def _elect(
+    first: int, last: int, weights: np.ndarray, scores: np.ndarray, pooled: np.ndarray, ratio: np.float32, best: np.ndarray
+) -> None:
+    """best (N, 2): the displacement (x, y) of each place on which it and its neighbours agree best, by weights (N, N).
+
+    NaN where another displacement, not beside it, has more than `ratio` of its score.
+    """
+    side = pooled.shape[1]
+    for n in range(first, last):
+        for m in range(len(weights)):
+            weight = weights[n, m]
+            if weight > 0:
+                for i in range(side):
+                    for j in range(side):
+                        scores[n, i + 1, j + 1] += weight * pooled[m, i, j]
+        top, at_i, at_j = np.float32(-1), 0, 0
+        for i in range(1, side + 1):
+            for j in range(1, side + 1):
+                if scores[n, i, j] > top:
+                    top, at_i, at_j = scores[n, i, j], i, j
+        second = np.float32(0)
+        for i in range(1, side + 1):
+            beside = abs(i - at_i) <= _BESIDE
+            for j in range(1, side + 1):
+                second = max(second, np.float32(0) if beside and abs(j - at_j) <= _BESIDE else scores[n, i, j])
+        unclear, middle = second > ratio * top, side // 2 + 1
+        x = at_j - middle + _vertex(scores[n, at_i, at_j - 1], top, scores[n, at_i, at_j + 1])
+        y = at_i - middle + _vertex(scores[n, at_i - 1, at_j], top, scores[n, at_i + 1, at_j])
+        best[n, 0], best[n, 1] = np.nan if unclear else x, np.nan if unclear else y
+
+
+@scalar
+def _vertex(below: np.float32, top: np.float32, above: np.float32) -> np.float32:
+    """Where the parabola through three neighbouring values, the middle one the largest, has its top; from the middle one."""
+    curvature = np.float32(2) * top - below - above
+    return np.float32(0.5) * (above - below) / curvature if curvature > np.float32(1e-6) else np.float32(0)
+
+
+def displacements_of(
+    words1: np.ndarray, words2: np.ndarray, places: np.ndarray, reach: int, config: PatchesConfig
+) -> np.ndarray:
+    """(N, 2) float32 displacements (x, y) of the places (N, 2) int, pixels of the smaller image; NaN where unclear."""
+    if not len(places):
+        return np.empty((0, 2), np.float32)
+    side = 2 * reach + 1
+    scores, pooled = (np.empty((len(places), size, size), np.float32) for size in (side + 2, side))
+    edges = [*range(0, len(places), _STACK), len(places)]
+    over_bands(_compare, edges, words1, words2, places, reach, scores, pooled)
+    squared = ((places[:, None] - places[None]) ** 2).sum(axis=2)
+    weights = np.exp(-squared / (2 * config.neighbours**2)) * ~np.eye(len(places), dtype=bool)
+    weights *= config.votes / np.maximum(weights.sum(axis=1, keepdims=True), 1)
+    weights[weights < _LEAST_VOTE] = 0
+    best = np.empty((len(places), 2), np.float32)
+    over_bands(_elect, edges, weights.astype(np.float32), scores, pooled, np.float32(config.ratio), best)
+    return best
+
+
+class Patches:
+    """The patches of two images, ready to be looked for.
+
+    Parameters
+    ----------
+    image1, image2 : np.ndarray
+        (H, W, channels) float32 in [0, 1].
+    config : PatchesConfig
+    """
+
+    def __init__(self, image1: np.ndarray, image2: np.ndarray, config: PatchesConfig) -> None:
+        self.config = config
+        self.shape = height, width = image1.shape[:2]
+        factor = max(1.0, np.sqrt(height * width / config.pixels))
+        self.small = max(1, round(height / factor)), max(1, round(width / factor))
+        self.scale = np.array([width / self.small[1], height / self.small[0]])
+        self.words = [describe(image, self.small, config.radius) for image in (image1, image2)]
+
+    def follow(self, surface: np.ndarray, most: int) -> tuple[np.ndarray, int]:
+        """Look for at most so many patches, spread evenly over a surface (H, W) bool.
+
+        Returns
+        -------
+        ends : np.ndarray
+            (N, 4) float64: x, y in image1 and in image2 of those that are seen again, in pixels.
+        looked_for : int
+            How many there were.
+        """
+        small = cv2.resize(surface.astype(np.uint8), self.small[::-1], interpolation=cv2.INTER_NEAREST)
+        places = np.argwhere(small)[:, ::-1]
+        places = places[np.linspace(0, len(places) - 1, min(most, len(places))).astype(np.intp)]
+        looked_for = len(places)
+        reach = max(1, int(self.config.reach * self.small[1]))
+        words1, words2 = self.words
+        there = places + displacements_of(words1, words2, places, reach, self.config)
+        clear = np.isfinite(there).all(axis=1)
+        places, there = places[clear], there[clear]
+        nearest = np.clip(np.rint(there).astype(np.intp), 0, np.array(self.small[::-1]) - 1)
+        back = nearest + displacements_of(words2, words1, nearest, reach, self.config)
+        home = (np.abs(back - places) <= self.config.return_px).all(axis=1)
+        return np.hstack([(ends[home] + 0.5) * self.scale - 0.5 for ends in (places, there)]), looked_for
