@@ -16,11 +16,14 @@ from variational.frames import Frames
 from variational.initialise import Start, dense_inverse_search
 from variational.patches import Patches, PatchesConfig
 from variational.rigid import RigidMotion, fit_surface
+from variational.state import D1, C
 
 MARGIN = 16
 """Pixels around a surface that dense inverse search sees too."""
 COARSE_PX = 4.0
 """How exactly the patches' places are known: as their pixels, for they turn."""
+ASTRAY_PX = 2.0
+"""A surface whose patches are nearer to where its motion leads is not lost."""
 FINE_PX = 2.0
 """How exactly those of dense inverse search are known, the first time."""
 
@@ -57,7 +60,7 @@ class ObjectsConfig:
         Settings of the patches.
     """
 
-    most: int = 12
+    most: int = 8
     cost: float = 0.45
     least_px: int = 150
     largest: float = 0.1
@@ -142,7 +145,7 @@ def follow(
 
 
 def find_objects(
-    start: Start, disparity: np.ndarray, frames: Frames, surfaces: list[np.ndarray], projection: np.ndarray, config: ObjectsConfig
+    start: Start, state: np.ndarray, frames: Frames, surfaces: list[np.ndarray], projection: np.ndarray, config: ObjectsConfig
 ) -> list[RigidMotion]:
     """Rigid motions of surfaces that dense flow lost.
 
@@ -150,8 +153,8 @@ def find_objects(
     ----------
     start : Start
         For the disparity at time 2.
-    disparity : np.ndarray
-        (H, W) at time 1, pixels.
+    state : np.ndarray
+        (5, H, W), pixels; of it D1, and the motion that explains the surfaces badly.
     frames : Frames
     surfaces : list of np.ndarray
         (H, W) bool masks.
@@ -166,18 +169,23 @@ def find_objects(
     """
     if not surfaces:
         return []
-    patches = Patches(frames.left1, frames.left2, config.patches)
-    motions = (_find(start, disparity, frames, surface, patches, projection, config) for surface in surfaces)
+    seen = Patches(frames.left1, frames.left2, config.patches).follow(surfaces, config.places)
+    found = zip(surfaces, seen, strict=True)
+    motions = (_fit(start, state, frames, surface, *patches, projection, config) for surface, patches in found)
     return [motion for motion in motions if motion is not None]
 
 
-def _find(
-    start: Start, disparity: np.ndarray, frames: Frames, surface: np.ndarray, patches: Patches, projection: np.ndarray,
-    config: ObjectsConfig,
+def _fit(
+    start: Start, state: np.ndarray, frames: Frames, surface: np.ndarray, seen: np.ndarray, looked_for: int,
+    projection: np.ndarray, config: ObjectsConfig,
 ) -> RigidMotion | None:  # fmt: skip
-    """The motion of a surface, if it is seen again and moves rigidly."""
+    """The motion of a surface, if it is seen again elsewhere than its motion so far leads to, and moves rigidly."""
+    disparity = state[D1]
     left1, _, left2, _ = frames.grey
-    seen, looked_for = patches.follow(surface, config.places)
+    x, y = np.rint(seen[:, :2]).astype(np.intp).T
+    astray = np.abs(seen[:, 2:] - seen[:, :2] - state[C + 1 :, y, x].T).max(axis=1)
+    if not len(seen) or np.median(astray) < ASTRAY_PX:
+        return None  # a shadow, a highlight: the images disagree, the motion is right
     first, second = _ends(start, disparity, seen, matched=False)
     least = max(config.least_places, config.seen * looked_for)
     for tolerance_px in (COARSE_PX, FINE_PX):

@@ -14,13 +14,15 @@ import numpy as np
 
 from variational.jit import over_bands, over_rows, rowwise, scalar
 
-#: Below this norm a patch is noise on an even surface (about 2 grey values of 255 a pixel); such patches correlate with nothing.
-_NOISE = 0.02
-_LEAST_VOTE = 1e-3
+# All that is summed is a whole number and small enough for float32 to hold the sum exactly: products of matrices then have the
+# same bits in whatever order, and on however many threads, they are summed.
+_NORM = 4000  # of a patch: its products stay below 2**24
+_SCORE = 1000  # of a patch with itself
+_SHARE = 4000  # weight of a patch's own score; with the votes' weights below 2**24 / _SCORE
+
+_NOISE = 0.02  # a patch that differs less from its mean (a pixel, in [0, 1]) is an even surface, and correlates with nothing
 _BESIDE = 3  # displacements so near belong to one maximum
-_WIDE = 4  # numbers of a patch that are multiplied in one pass over a row of scores
-_STACK = 8
-"""Places whose scores are found by one thread before the next: the unit of work."""
+_STACK = 8  # places that a thread takes at once
 
 
 @dataclass(frozen=True)
@@ -55,21 +57,21 @@ class PatchesConfig:
     ratio: float = 0.9
 
     def __post_init__(self) -> None:
-        if self.pixels < 1 or self.radius < 1:
-            raise ValueError("PatchesConfig needs pixels >= 1 and radius >= 1")
+        if self.pixels < 1 or self.radius < 1 or not 0 <= self.votes <= 3:
+            raise ValueError("PatchesConfig needs pixels >= 1, radius >= 1 and votes between 0 and 3")
 
 
 @rowwise
 def _describe(first: int, last: int, padded: np.ndarray, radius: int, words: np.ndarray) -> None:
-    """words (h, n, w): the patch around each pixel less its mean in each channel; of unit norm, or less where it is even.
+    """words (h, w, n): the patch around each pixel less its mean in each channel; of norm _NORM, or less where it is even.
 
     padded: (h + 2 radius, w + 2 radius, channels).
     """
-    width, channels, side = words.shape[2], padded.shape[2], 2 * radius + 1
+    channels, side = padded.shape[2], 2 * radius + 1
     area = np.float32(side * side)
     for y in range(first, last):
-        for x in range(width):
-            power = np.float32(0)
+        for x in range(words.shape[1]):
+            power, place = np.float32(0), 0
             for c in range(channels):
                 mean = np.float32(0)
                 for i in range(side):
@@ -79,37 +81,35 @@ def _describe(first: int, last: int, padded: np.ndarray, radius: int, words: np.
                 for i in range(side):
                     for j in range(side):
                         value = padded[y + i, x + j, c] - mean
-                        words[y, (c * side + i) * side + j, x] = value
+                        words[y, x, place] = value
                         power += value * value
-            scale = np.float32(1) / np.sqrt(power + np.float32(_NOISE * _NOISE) * area * np.float32(channels))
-            for k in range(words.shape[1]):
-                words[y, k, x] *= scale
+                        place += 1
+            scale = np.float32(_NORM) / np.sqrt(power + np.float32(_NOISE * _NOISE) * area * np.float32(channels))
+            for k in range(place):
+                words[y, x, k] = np.rint(scale * words[y, x, k])
 
 
 def describe(image: np.ndarray, shape: tuple[int, int], radius: int) -> np.ndarray:
-    """(h, n, w) float32 patches around the pixels of an image (H, W, channels) made smaller to `shape` (h, w), n filled up with
-    zeros to a multiple of four."""
+    """(h, w, n) float32 patches around the pixels of an image (H, W, channels) made smaller to `shape` (h, w)."""
     small = cv2.resize(image, shape[::-1], interpolation=cv2.INTER_AREA)
     small = cv2.GaussianBlur(small, (0, 0), 0.7).reshape(*shape, -1).astype(np.float32)  # OpenCV drops a single channel
     padded = np.pad(small, ((radius, radius), (radius, radius), (0, 0)), mode="edge")
-    count = (2 * radius + 1) ** 2 * small.shape[2]
-    words = np.zeros((shape[0], count + -count % _WIDE, shape[1]), np.float32)
+    words = np.empty((*shape, (2 * radius + 1) ** 2 * small.shape[2]), np.float32)
     over_rows(_describe, shape[0], padded, radius, words)
     return words
 
 
 @rowwise
-def _compare(
-    first: int, last: int, words1: np.ndarray, words2: np.ndarray, places: np.ndarray, reach: int, scores: np.ndarray,
-    pooled: np.ndarray,
-) -> None:  # fmt: skip
+def _score(
+    first: int, last: int, products: np.ndarray, places: np.ndarray, reach: int, scores: np.ndarray, pooled: np.ndarray
+) -> None:
     """scores (N, S + 2, S + 2) of the places (N, 2: x, y) at each displacement, S = 2 reach + 1, inside a border of zeros.
 
     A score is the correlation to the power of 1.5, 0 if negative or outside: what agrees well counts for more.
-    pooled (N, S, S): their maximum over 3 x 3.
+    products (N, h, w): of the places' patches with all of the other image; pooled (N, S, S): maximum of scores over 3 x 3.
     """
-    height, count, width = words2.shape
-    side, zero = 2 * reach + 1, np.float32(0)
+    _, height, width = products.shape
+    side, zero, unit = 2 * reach + 1, np.float32(0), np.float32(1 / _NORM**2)
     for n in range(first, last):
         x, y = places[n, 0], places[n, 1]
         for i in range(side + 2):
@@ -120,15 +120,9 @@ def _compare(
         at, start, size = np.uint64(begin - (x - reach) + 1), np.uint64(begin), np.uint64(max(end - begin, 0))
         for to_y in range(max(y - reach, 0), min(y + reach + 1, height)):
             i = to_y - (y - reach) + 1
-            for k in range(0, count, _WIDE):
-                a, b, c, d = words1[y, k, x], words1[y, k + 1, x], words1[y, k + 2, x], words1[y, k + 3, x]
-                for j in range(size):
-                    to_x = start + j
-                    one = a * words2[to_y, k, to_x] + b * words2[to_y, k + 1, to_x]
-                    scores[n, i, at + j] += one + (c * words2[to_y, k + 2, to_x] + d * words2[to_y, k + 3, to_x])
-            for j in range(1, side + 1):
-                positive = max(scores[n, i, j], zero)
-                scores[n, i, j] = positive * np.sqrt(positive)
+            for j in range(size):
+                correlation = max(unit * products[n, to_y, start + j], zero)
+                scores[n, i, at + j] = np.rint(np.float32(_SCORE) * correlation * np.sqrt(correlation))
         for i in range(side):
             for j in range(side):
                 above = max(scores[n, i, j], scores[n, i, j + 1], scores[n, i, j + 2])
@@ -138,21 +132,16 @@ def _compare(
 
 
 @rowwise
-def _elect(
-    first: int, last: int, weights: np.ndarray, scores: np.ndarray, pooled: np.ndarray, ratio: np.float32, best: np.ndarray
-) -> None:
-    """best (N, 2): the displacement (x, y) of each place on which it and its neighbours agree best, by weights (N, N).
+def _elect(first: int, last: int, scores: np.ndarray, votes: np.ndarray, ratio: np.float32, best: np.ndarray) -> None:
+    """best (N, 2): the displacement (x, y) of each place that has most of its own score and of the votes (N, S, S).
 
-    NaN where another displacement, not beside it, has more than `ratio` of its score.
+    NaN where another displacement, not beside it, has more than `ratio` of that.
     """
-    side = pooled.shape[1]
+    side = votes.shape[1]
     for n in range(first, last):
-        for m in range(len(weights)):
-            weight = weights[n, m]
-            if weight > 0:
-                for i in range(side):
-                    for j in range(side):
-                        scores[n, i + 1, j + 1] += weight * pooled[m, i, j]
+        for i in range(side):
+            for j in range(side):
+                scores[n, i + 1, j + 1] = np.float32(_SHARE) * scores[n, i + 1, j + 1] + votes[n, i, j]
         top, at_i, at_j = np.float32(-1), 0, 0
         for i in range(1, side + 1):
             for j in range(1, side + 1):
@@ -173,26 +162,36 @@ def _elect(
 def _vertex(below: np.float32, top: np.float32, above: np.float32) -> np.float32:
     """Where the parabola through three neighbouring values, the middle one the largest, has its top; from the middle one."""
     curvature = np.float32(2) * top - below - above
-    return np.float32(0.5) * (above - below) / curvature if curvature > np.float32(1e-6) else np.float32(0)
+    return np.float32(0.5) * (above - below) / curvature if curvature > np.float32(0) else np.float32(0)
 
 
 def displacements_of(
-    words1: np.ndarray, words2: np.ndarray, places: np.ndarray, reach: int, config: PatchesConfig
+    words1: np.ndarray, words2: np.ndarray, places: np.ndarray, groups: np.ndarray, reach: int, config: PatchesConfig
 ) -> np.ndarray:
-    """(N, 2) float32 displacements (x, y) of the places (N, 2) int, pixels of the smaller image; NaN where unclear."""
-    if not len(places):
-        return np.empty((0, 2), np.float32)
-    side = 2 * reach + 1
-    scores, pooled = (np.empty((len(places), size, size), np.float32) for size in (side + 2, side))
-    edges = [*range(0, len(places), _STACK), len(places)]
-    over_bands(_compare, edges, words1, words2, places, reach, scores, pooled)
+    """(N, 2) float32 displacements (x, y) of the places (N, 2) int, pixels of the smaller image; NaN where unclear.
+
+    groups (N,): places of one number vote for one another.
+    """
+    count, side = len(places), 2 * reach + 1
+    scores, pooled, votes = (np.empty((count, each, each), np.float32) for each in (side + 2, side, side))
+    edges = [*range(0, count, _STACK), count]
+    # all at once: the threads of a product of matrices idle on for a while after it, and take time from other stages
+    products = words1[places[:, 1], places[:, 0]] @ words2.reshape(-1, words2.shape[2]).T
+    over_bands(_score, edges, products.reshape(count, *words2.shape[:2]), places, reach, scores, pooled)
+    for group in np.unique(groups):
+        mine = groups == group
+        together = _shares(places[mine], config) @ pooled[mine].reshape(-1, side * side)
+        votes[mine] = together.reshape(-1, side, side)
+    best = np.empty((count, 2), np.float32)
+    over_bands(_elect, edges, scores, votes, np.float32(config.ratio), best)
+    return best
+
+
+def _shares(places: np.ndarray, config: PatchesConfig) -> np.ndarray:
+    """(N, N) float32: what the scores of the places (N, 2) weigh for one another, whole numbers of at most _SHARE votes a row."""
     squared = ((places[:, None] - places[None]) ** 2).sum(axis=2)
     weights = np.exp(-squared / (2 * config.neighbours**2)) * ~np.eye(len(places), dtype=bool)
-    weights *= config.votes / np.maximum(weights.sum(axis=1, keepdims=True), 1)
-    weights[weights < _LEAST_VOTE] = 0
-    best = np.empty((len(places), 2), np.float32)
-    over_bands(_elect, edges, weights.astype(np.float32), scores, pooled, np.float32(config.ratio), best)
-    return best
+    return np.floor(_SHARE * config.votes * weights / np.maximum(weights.sum(axis=1, keepdims=True), 1)).astype(np.float32)
 
 
 class Patches:
@@ -213,26 +212,31 @@ class Patches:
         self.scale = np.array([width / self.small[1], height / self.small[0]])
         self.words = [describe(image, self.small, config.radius) for image in (image1, image2)]
 
-    def follow(self, surface: np.ndarray, most: int) -> tuple[np.ndarray, int]:
-        """Look for at most so many patches, spread evenly over a surface (H, W) bool.
+    def follow(self, surfaces: list[np.ndarray], most: int) -> list[tuple[np.ndarray, int]]:
+        """Look for at most so many patches of each surface (H, W) bool, spread evenly over it.
 
         Returns
         -------
-        ends : np.ndarray
-            (N, 4) float64: x, y in image1 and in image2 of those that are seen again, in pixels.
-        looked_for : int
-            How many there were.
+        list of (ends, looked_for)
+            For each surface: (N, 4) float64, x, y in image1 and in image2 of those that are seen again, in pixels; and how many
+            were looked for.
         """
-        small = cv2.resize(surface.astype(np.uint8), self.small[::-1], interpolation=cv2.INTER_NEAREST)
-        places = np.argwhere(small)[:, ::-1]
-        places = places[np.linspace(0, len(places) - 1, min(most, len(places))).astype(np.intp)]
-        looked_for = len(places)
+        found = [self._places(surface, most) for surface in surfaces]
+        groups = np.repeat(np.arange(len(found)), [len(places) for places in found])
+        places = np.concatenate([*found, np.empty((0, 2), np.intp)])
         reach = max(1, int(self.config.reach * self.small[1]))
         words1, words2 = self.words
-        there = places + displacements_of(words1, words2, places, reach, self.config)
+        there = places + displacements_of(words1, words2, places, groups, reach, self.config)
         clear = np.isfinite(there).all(axis=1)
-        places, there = places[clear], there[clear]
+        places, there, groups = places[clear], there[clear], groups[clear]
         nearest = np.clip(np.rint(there).astype(np.intp), 0, np.array(self.small[::-1]) - 1)
-        back = nearest + displacements_of(words2, words1, nearest, reach, self.config)
+        back = nearest + displacements_of(words2, words1, nearest, groups, reach, self.config)
         home = (np.abs(back - places) <= self.config.return_px).all(axis=1)
-        return np.hstack([(ends[home] + 0.5) * self.scale - 0.5 for ends in (places, there)]), looked_for
+        ends = np.hstack([(ends + 0.5) * self.scale - 0.5 for ends in (places, there)])
+        return [(ends[home & (groups == group)], len(places)) for group, places in enumerate(found)]
+
+    def _places(self, surface: np.ndarray, most: int) -> np.ndarray:
+        """(N, 2) x, y in the smaller image."""
+        small = cv2.resize(surface.astype(np.uint8), self.small[::-1], interpolation=cv2.INTER_NEAREST)
+        places = np.argwhere(small)[:, ::-1]
+        return places[np.linspace(0, len(places) - 1, min(most, len(places))).astype(np.intp)]

@@ -193,7 +193,7 @@ def propose(
 
     def lost_objects() -> list[RigidMotion]:
         surfaces = unexplained_surfaces(state[D1], cost, project_visibility(state), start.match1.matched, objects)
-        return find_objects(start, state[D1], frames, surfaces, known.projection(), objects)
+        return find_objects(start, state, frames, surfaces, known.projection(), objects)
 
     homographies = np.stack([motion.homography for motion in motions])
     disparity, found = side_by_side(

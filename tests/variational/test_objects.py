@@ -43,6 +43,13 @@ def start_with(disparity: np.ndarray, matched: np.ndarray) -> Start:
     return Start(np.zeros((5, *SHAPE), np.float32), np.zeros((*SHAPE, 2), np.float32), match, match)
 
 
+def standing(disparity: np.ndarray) -> np.ndarray:
+    """The state in which nothing moves."""
+    state = np.zeros((5, *SHAPE), np.float32)
+    state[0] = disparity
+    return state
+
+
 def test_surfaces_end_where_the_disparity_jumps():
     disparity = np.full((30, 40), 5, np.float32)
     disparity[:, 20:] = 9
@@ -76,7 +83,7 @@ def test_a_lost_box_gets_its_motion() -> None:
     disparity2 = np.full(SHAPE, 5, np.float32)
     disparity2[50 + SHIFT[1] : 90 + SHIFT[1], 60 + SHIFT[0] : 110 + SHIFT[0]] = 12
     start = start_with(disparity2, np.ones(SHAPE, bool))
-    (motion,) = find_objects(start, disparity, frames, [surface], PROJECTION, FAR)
+    (motion,) = find_objects(start, standing(disparity), frames, [surface], PROJECTION, FAR)
     labels = np.zeros((1, *SHAPE), np.int32)
     change, u, v = displacements(motion.homography[None], labels, disparity)[0][:, surface]
     assert abs(np.median(change)) < 0.2
@@ -85,7 +92,7 @@ def test_a_lost_box_gets_its_motion() -> None:
     np.testing.assert_array_equal(motion.support, surface)
 
 
-@pytest.mark.parametrize("case", ["no surface", "nothing rigid", "nothing matched", "nothing seen again"])
+@pytest.mark.parametrize("case", ["no surface", "nothing rigid", "nothing matched", "nothing seen again", "not lost"])
 def test_nothing_is_invented(case: str) -> None:
     left1, left2, surface = jumping_box()
     random = np.random.default_rng(5).uniform(3, 60, SHAPE).astype(np.float32)
@@ -93,8 +100,11 @@ def test_nothing_is_invented(case: str) -> None:
     start = start_with(disparity2, np.full(SHAPE, case != "nothing matched"))
     left2 = texture(8) if case == "nothing seen again" else left2
     surfaces = [] if case == "no surface" else [surface]
+    state = standing(np.full(SHAPE, 12, np.float32))
+    if case == "not lost":
+        state[3], state[4] = SHIFT
     frames = Frames(*(image[..., None] for image in (left1, left1, left2, left2)))
-    assert find_objects(start, np.full(SHAPE, 12, np.float32), frames, surfaces, PROJECTION, FAR) == []
+    assert find_objects(start, state, frames, surfaces, PROJECTION, FAR) == []
 
 
 def test_the_scene_is_no_object_and_the_largest_comes_first() -> None:

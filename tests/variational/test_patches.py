@@ -9,34 +9,35 @@ from variational.patches import Patches, PatchesConfig, describe, displacements_
 
 
 def plain_words(small: np.ndarray, radius: int) -> np.ndarray:
-    """(h, n, w) of an image (h, w, channels), one pixel after the other."""
+    """(h, w, n), of unit norm, of an image (h, w, channels), one pixel after the other."""
     height, width, channels = small.shape
     padded = np.pad(small.astype(np.float64), ((radius, radius), (radius, radius), (0, 0)), mode="edge")
-    words = np.empty((height, channels * (2 * radius + 1) ** 2, width))
+    words = np.empty((height, width, channels * (2 * radius + 1) ** 2))
     for y in range(height):
         for x in range(width):
             patch = padded[y : y + 2 * radius + 1, x : x + 2 * radius + 1].transpose(2, 0, 1)
             patch = patch - patch.mean(axis=(1, 2), keepdims=True)
-            words[y, :, x] = patch.ravel() / np.sqrt((patch**2).sum() + 0.02**2 * patch.size)
+            words[y, x] = patch.ravel() / np.sqrt((patch**2).sum() + 0.02**2 * patch.size)
     return words
 
 
 def plain_displacements(
-    words1: np.ndarray, words2: np.ndarray, places: np.ndarray, reach: int, config: PatchesConfig
+    words1: np.ndarray, words2: np.ndarray, places: np.ndarray, groups: np.ndarray, reach: int, config: PatchesConfig
 ) -> np.ndarray:
     """Whole pixels, without a parabola; NaN where unclear."""
-    side, (height, _, width) = 2 * reach + 1, words2.shape
+    side, (height, width, _) = 2 * reach + 1, words2.shape
     scores = np.zeros((len(places), side, side))
     for n, (x, y) in enumerate(places):
         for i, to_y in enumerate(range(y - reach, y + reach + 1)):
             for j, to_x in enumerate(range(x - reach, x + reach + 1)):
                 if 0 <= to_x < width and 0 <= to_y < height:
-                    scores[n, i, j] = max(words1[y, :, x] @ words2[to_y, :, to_x], 0) ** 1.5
+                    scores[n, i, j] = max(words1[y, x] @ words2[to_y, to_x] / 4000**2, 0) ** 1.5
     pooled = np.stack([cv2.dilate(each, np.ones((3, 3))) for each in scores])
     found = np.empty((len(places), 2))
     for n in range(len(places)):
         near = np.exp(-((places - places[n]) ** 2).sum(axis=1) / (2 * config.neighbours**2))
         near[n] = 0
+        near[groups != groups[n]] = 0
         total = scores[n] + config.votes * np.tensordot(near, pooled, 1) / max(near.sum(), 1)
         i, j = np.unravel_index(total.argmax(), total.shape)
         found[n] = j - reach, i - reach
@@ -52,9 +53,8 @@ def test_words_equal_the_plain_ones() -> None:
     image[:12, :16] = 0.5  # even: nothing but noise there
     small = cv2.GaussianBlur(cv2.resize(image, (17, 13), interpolation=cv2.INTER_AREA), (0, 0), 0.7)
     words = describe(image, (13, 17), 2)
-    np.testing.assert_allclose(words[:, :75], plain_words(small, 2), atol=2e-6)
-    assert words.shape == (13, 76, 17)
-    assert not words[:, 75:].any()
+    np.testing.assert_allclose(words, 4000 * plain_words(small, 2), atol=0.51)
+    np.testing.assert_array_equal(words, np.rint(words))
 
 
 @pytest.mark.parametrize("votes", [0.0, 2.0])
@@ -62,9 +62,10 @@ def test_displacements_equal_the_plain_ones(votes: float) -> None:
     random, config = np.random.default_rng(1), PatchesConfig(votes=votes, neighbours=4.0)
     image = random.random((19, 27, 1), dtype=np.float32)
     words1, words2 = (describe(each, image.shape[:2], 1) for each in (image, np.roll(image, (2, -3), (0, 1))))
-    places = np.argwhere(random.random(image.shape[:2]) < 0.04)[:, ::-1]
-    found = displacements_of(words1, words2, places, 5, config)
-    expected = plain_displacements(words1, words2, places, 5, config)
+    places = np.argwhere(random.random(image.shape[:2]) < 0.08)[:, ::-1]
+    groups = random.integers(0, 2, len(places))
+    found = displacements_of(words1, words2, places, groups, 5, config)
+    expected = plain_displacements(words1, words2, places, groups, 5, config)
     np.testing.assert_array_equal(np.isnan(found), np.isnan(expected))
     assert np.isfinite(found).any()
     assert (np.abs(found - expected)[np.isfinite(expected)] <= 0.5).all()
@@ -78,7 +79,9 @@ def test_a_turned_surface_is_followed(channels: int) -> None:
     image2 = cv2.warpAffine(image1, turn, (320, 200)).reshape(image1.shape)
     surface = np.zeros((200, 320), bool)
     surface[60:140, 90:210] = True
-    ends, looked_for = Patches(image1, image2, PatchesConfig(pixels=4000)).follow(surface, 40)
+    unseen = np.zeros_like(surface)
+    (ends, looked_for), nothing = Patches(image1, image2, PatchesConfig(pixels=4000)).follow([surface, unseen], 40)
+    assert nothing[1] == 0
     assert looked_for == 40
     expected = np.column_stack([ends[:, :2], np.ones(len(ends))]) @ turn.T
     distance = np.linalg.norm(ends[:, 2:] - expected, axis=1)
@@ -97,8 +100,9 @@ def test_neighbours_decide_what_a_patch_cannot() -> None:
     image2[20:27, 30:37] += 0.2 * np.random.default_rng(4).random((7, 7, 1), dtype=np.float32)
     words1, words2 = (describe(each, (40, 60), 3) for each in (image1, image2))
     places = np.array([[25, 20], [22, 18], [28, 22], [22, 22], [28, 18]])
-    alone = displacements_of(words1, words2, places, 16, PatchesConfig(votes=0, ratio=1))
-    together = displacements_of(words1, words2, places, 16, PatchesConfig(ratio=1))
+    one = np.zeros(len(places), int)
+    alone = displacements_of(words1, words2, places, one, 16, PatchesConfig(votes=0, ratio=1))
+    together = displacements_of(words1, words2, places, one, 16, PatchesConfig(ratio=1))
     assert np.abs(alone[0] - (8, 3)).max() > 5
     np.testing.assert_allclose(together, np.tile([8, 3], (5, 1)), atol=0.6)
 
@@ -109,9 +113,10 @@ def test_a_repeated_pattern_is_unclear() -> None:
     surface = np.zeros(fence.shape[:2], bool)
     surface[40:80, 80:160] = True
     patches, places = Patches(fence, moved, PatchesConfig(pixels=1800)), np.array([[28, 15], [30, 12]])
-    assert np.isfinite(displacements_of(*patches.words, places, 9, PatchesConfig(ratio=1))).all()
-    assert np.isnan(displacements_of(*patches.words, places, 9, PatchesConfig())).all()
-    assert len(patches.follow(surface, 40)[0]) == 0
+    one = np.zeros(2, int)
+    assert np.isfinite(displacements_of(*patches.words, places, one, 9, PatchesConfig(ratio=1))).all()
+    assert np.isnan(displacements_of(*patches.words, places, one, 9, PatchesConfig())).all()
+    assert len(patches.follow([surface], 40)[0][0]) == 0
 
 
 @pytest.mark.parametrize("case", ["no surface", "flat", "tiny"])
@@ -120,12 +125,21 @@ def test_nothing_to_follow(case: str) -> None:
     image = np.full((*shape, 3), 0.5, np.float32) if case != "tiny" else texture(0, shape)[..., None]
     surface = np.zeros(shape, bool)
     surface[4:12, 4:12] = case != "no surface"
-    ends, looked_for = Patches(image, image, PatchesConfig(pixels=len(surface) * len(surface[0]) // 16)).follow(surface, 20)
+    ((ends, looked_for),) = Patches(image, image, PatchesConfig(pixels=surface.size // 16)).follow([surface], 20)
     assert looked_for == (0 if case == "no surface" else 4)
     assert len(ends) == 0 or case == "tiny"
     np.testing.assert_allclose(ends[:, 2:], ends[:, :2], atol=2)
 
 
 def test_settings_that_cannot_be() -> None:
-    with pytest.raises(ValueError, match="radius"):
-        PatchesConfig(radius=0)
+    for wrong in ({"radius": 0}, {"pixels": 0}, {"votes": 4.0}):
+        with pytest.raises(ValueError, match=next(iter(wrong))):
+            PatchesConfig(**wrong)
+
+
+def test_sums_are_exact() -> None:
+    """The largest product of two patches, and the largest sum of votes: whole numbers that float32 still holds."""
+    words = describe(texture(6, (40, 60))[..., None], (40, 60), 3)
+    power = (words.astype(np.float64) ** 2).sum(axis=2)
+    assert 3900**2 < power.max() < 2**24
+    assert 4000 * (1 + 3) * 1000 < 2**24
