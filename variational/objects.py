@@ -133,7 +133,7 @@ def follow(
     near = np.where(np.abs(disparity[part] - middle) < 0.3 * middle + 5, disparity[part], middle)
     y, x = np.indices(near.shape) + np.array([top, left])[:, None, None]
     moved = np.stack([x, y, near, np.ones_like(near)], axis=-1) @ homography.T
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(all="ignore"):  # points that come to lie beside the camera
         to = np.nan_to_num((moved[..., :2] / moved[..., 3:]).astype(np.float32), posinf=-1, neginf=-1)
     seen = cv2.remap(left2, to, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     flow = _flow_at_most(np.ascontiguousarray(left1[part]), seen, config.flow_px)
