@@ -21,6 +21,7 @@ _SCORE = 1000  # of a patch with itself
 _SHARE = 4000  # weight of a patch's own score; with the votes' weights below 2**24 / _SCORE
 
 _NOISE = 0.02  # a patch that differs less from its mean (a pixel, in [0, 1]) is an even surface, and correlates with nothing
+_MOST_REACH = 64  # bounds the memory for images that are much wider than high
 _BESIDE = 3  # displacements so near belong to one maximum
 _STACK = 8  # places that a thread takes at once
 
@@ -36,7 +37,7 @@ class PatchesConfig:
     radius : int
         Patches have 2 radius + 1 pixels of the smaller image on a side.
     reach : float
-        Largest displacement along x and y, as a share of the image's width.
+        Largest displacement along x and y, as a share of the image's width; at most 64 pixels of the smaller image.
     votes : float
         Weight of the neighbours' mean score beside a patch's own; 0 lets none vote.
     neighbours : float
@@ -209,6 +210,7 @@ class Patches:
         self.shape = height, width = image1.shape[:2]
         factor = max(1.0, np.sqrt(height * width / config.pixels))
         self.small = max(1, round(height / factor)), max(1, round(width / factor))
+        self.reach = min(max(1, int(config.reach * self.small[1])), _MOST_REACH)
         self.scale = np.array([width / self.small[1], height / self.small[0]])
         self.words = [describe(image, self.small, config.radius) for image in (image1, image2)]
 
@@ -224,13 +226,12 @@ class Patches:
         found = [self._places(surface, most) for surface in surfaces]
         groups = np.repeat(np.arange(len(found)), [len(places) for places in found])
         places = np.concatenate([*found, np.empty((0, 2), np.intp)])
-        reach = max(1, int(self.config.reach * self.small[1]))
         words1, words2 = self.words
-        there = places + displacements_of(words1, words2, places, groups, reach, self.config)
+        there = places + displacements_of(words1, words2, places, groups, self.reach, self.config)
         clear = np.isfinite(there).all(axis=1)
         places, there, groups = places[clear], there[clear], groups[clear]
         nearest = np.clip(np.rint(there).astype(np.intp), 0, np.array(self.small[::-1]) - 1)
-        back = nearest + displacements_of(words2, words1, nearest, groups, reach, self.config)
+        back = nearest + displacements_of(words2, words1, nearest, groups, self.reach, self.config)
         home = (np.abs(back - places) <= self.config.return_px).all(axis=1)
         ends = np.hstack([(ends + 0.5) * self.scale - 0.5 for ends in (places, there)])
         return [(ends[home & (groups == group)], len(places)) for group, places in enumerate(found)]

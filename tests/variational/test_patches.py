@@ -131,6 +131,13 @@ def test_nothing_to_follow(case: str) -> None:
     np.testing.assert_allclose(ends[:, 2:], ends[:, :2], atol=2)
 
 
+def test_memory_is_bounded_for_panoramas() -> None:
+    """Scores take the square of the reach: at its share of such a width they would take 9 GB."""
+    image = np.zeros((16, 40_000, 1), np.float32)
+    assert Patches(image, image, PatchesConfig()).reach == 64
+    assert Patches(image[:, :40], image[:, :40], PatchesConfig()).reach == 6
+
+
 def test_settings_that_cannot_be() -> None:
     for wrong in ({"radius": 0}, {"pixels": 0}, {"votes": 4.0}):
         with pytest.raises(ValueError, match=next(iter(wrong))):
