@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 
 from variational.camera import StereoCamera
+from variational.edges import EdgesConfig, other_sides
 from variational.evidence import EvidenceConfig, refill
 from variational.frames import Frames
 from variational.fusion import FusionConfig, choose, motion_costs
@@ -141,6 +142,7 @@ def _take(
 def propose(
     start: Start, frames: Frames, camera: StereoCamera | None, matching: MatchingConfig, rigid: RigidConfig,
     objects: ObjectsConfig, planes: PlanesConfig, fusion: FusionConfig, evidence: EvidenceConfig,
+    edges: EdgesConfig,
 ) -> Proposal:  # fmt: skip
     """Fuse the start with rigid motions.
 
@@ -199,7 +201,7 @@ def propose(
     disparity, found = side_by_side(
         lambda: refill(match1, start.match2, grey, labels, homographies, matching, evidence), lost_objects
     )
-    state[D1] = disparity
+    state[D1] = disparity.ravel()[other_sides(disparity, frames.left1, edges)]
     motions += found
     labels, cost = fuse(2)
     return Proposal(state, labels, motions, cost)

@@ -12,6 +12,7 @@ import numpy as np
 from variational.camera import StereoCamera
 from variational.confidence import confidence
 from variational.descent import DescentConfig, FromZeroConfig, History, RefineConfig, descend_energy, from_zero, refine
+from variational.edges import EdgesConfig, other_sides
 from variational.energy import EnergyConfig
 from variational.evidence import EvidenceConfig
 from variational.frames import Frames
@@ -24,7 +25,7 @@ from variational.planes import PlanesConfig
 from variational.proposals import MEASURED, keep, propose
 from variational.pyramid import resize_image
 from variational.rigid import RigidConfig
-from variational.state import enlarge_state, flow_of
+from variational.state import D1, enlarge_state, flow_of
 from variational.terms.constancy import ConstancyConfig
 from variational.visibility import backward_flow, project_visibility
 
@@ -46,7 +47,7 @@ class SolverConfig:
         no such limit.
     proposals : bool
         Fuse the start with rigid motions (variational.proposals).
-    matching, rigid, objects, planes, fusion, evidence, from_zero, refine, constancy
+    matching, rigid, objects, planes, fusion, evidence, edges, from_zero, refine, constancy
         Settings of the parts.
     descent, energy
         First-order descent of the consistency energy after all else, and that energy; off unless descent.levels > 0.
@@ -61,6 +62,7 @@ class SolverConfig:
     planes: PlanesConfig = field(default_factory=PlanesConfig)
     fusion: FusionConfig = field(default_factory=FusionConfig)
     evidence: EvidenceConfig = field(default_factory=EvidenceConfig)
+    edges: EdgesConfig = field(default_factory=EdgesConfig)
     from_zero: FromZeroConfig = field(default_factory=FromZeroConfig)
     refine: RefineConfig = field(default_factory=RefineConfig)
     constancy: ConstancyConfig = field(default_factory=ConstancyConfig)
@@ -167,7 +169,7 @@ def solve(
         with stage("proposals", 0.5):
             proposal = propose(
                 start, frames, camera, config.matching, config.rigid, config.objects, config.planes,
-                config.fusion, config.evidence,
+                config.fusion, config.evidence, config.edges,
             )  # fmt: skip
     with stage("refine", 0.8):
         matched = (start.match1.matched, start.match2.matched)
@@ -206,13 +208,15 @@ def _solve_smaller(
     def enlarged(mask: np.ndarray) -> np.ndarray:
         return cv2.resize(mask.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST_EXACT) > 0
 
+    state = enlarge_state(found.state, frames.shape)
+    source = other_sides(state[D1], frames.left1, config.edges)
     backward = cv2.resize(found.backward_flow, (width, height)) * np.array([width / columns, height / rows], np.float32)
     return replace(
         found,
-        state=enlarge_state(found.state, frames.shape),
+        state=state.reshape(5, -1)[:, source],
         visible=enlarged(found.visible),
         confidence=cv2.resize(found.confidence, (width, height)),
-        moving=None if found.moving is None else enlarged(found.moving),
+        moving=None if found.moving is None else enlarged(found.moving).ravel()[source],
         initial_state=enlarge_state(found.initial_state, frames.shape),
         backward_flow=backward,
         seconds={**found.seconds, "resizing": resizing + time.perf_counter() - begin},
