@@ -344,12 +344,13 @@ def find_motions(matches: Correspondences, camera: StereoCamera, config: RigidCo
     if not config.max_objects:
         return motions
     left &= ~ego.support
-    pieces, order = _pieces(matches, left, config)
+    least = max(config.min_points, config.min_object * left.size)
+    pieces, order = _pieces(matches, left, least, config)
     for label in order:
         if len(motions) > config.max_objects:
             break
         region = (pieces == label) & left
-        if np.count_nonzero(region) < max(config.min_points, config.min_object * left.size):
+        if np.count_nonzero(region) < least:
             continue
         motion = fit(region, config.min_inliers)
         if motion is not None:
@@ -358,10 +359,14 @@ def find_motions(matches: Correspondences, camera: StereoCamera, config: RigidCo
     return motions
 
 
-def _pieces(matches: Correspondences, left: np.ndarray, config: RigidConfig) -> tuple[np.ndarray, np.ndarray]:
-    """Connected pieces of the pixels `left`: (H, W) labels, and the labels from the largest piece to the smallest."""
+def _pieces(
+    matches: Correspondences, left: np.ndarray, least: float, config: RigidConfig
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Connected pieces of the pixels `left`: (H, W) labels, and those of `least` pixels or more, from the largest on."""
     smooth = np.empty(left.shape, np.uint8)
     over_rows(_continuous, len(left), matches.first, matches.second, left, 2 * config.tolerance_px, smooth)
     opened = cv2.morphologyEx(smooth, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     _, labels, statistics, _ = cv2.connectedComponentsWithStats(opened, connectivity=4)
-    return labels, np.argsort(-statistics[1:, cv2.CC_STAT_AREA], kind="stable")[:64] + 1
+    areas = statistics[1:, cv2.CC_STAT_AREA]
+    order = np.argsort(-areas, kind="stable")[:64]
+    return labels, order[areas[order] >= least] + 1
