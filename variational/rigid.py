@@ -231,20 +231,22 @@ def _gauss_newton(
         X, Y, Z, residual, weight = X[usable], Y[usable], Z[usable], residual[usable], weight[usable]
         if len(Z) < 6:
             return None
-        zero, root = np.zeros_like(Z), np.sqrt(weight)
-        # derivative of (x, y, disparity) by translation (3) and rotation (3)
-        jacobian = np.stack([
-            np.stack([fx / Z, zero, -fx * X / Z**2, -fx * X * Y / Z**2, fx * (1 + X**2 / Z**2), -fx * Y / Z], axis=1),
-            np.stack([zero, fy / Z, -fy * Y / Z**2, -fy * (1 + Y**2 / Z**2), fy * X * Y / Z**2, fy * X / Z], axis=1),
-            np.stack([zero, zero, -fb / Z**2, -fb * Y / Z**2, fb * X / Z**2, zero], axis=1),
-        ])  # fmt: skip
-        jacobian = (jacobian * root[None, :, None]).reshape(-1, 6)
+        # derivatives of (x, y, disparity) by translation (3) and rotation (3), one row an unknown
+        jacobian = np.zeros((6, 3, len(Z)))
+        x, y, inverse = X / Z, Y / Z, 1 / Z
+        jacobian[0, 0], jacobian[1, 1] = fx * inverse, fy * inverse
+        jacobian[2] = -fx * x * inverse, -fy * y * inverse, -fb * inverse**2
+        jacobian[3] = -fx * x * y, -fy * (1 + y**2), -fb * y * inverse
+        jacobian[4] = fx * (1 + x**2), fy * x * y, fb * x * inverse
+        jacobian[5, 0], jacobian[5, 1] = -fx * y, fy * x
+        root = np.sqrt(weight)
+        jacobian = (jacobian * root).reshape(6, -1)
         weighted = (residual.T * root).ravel()
-        normal = jacobian.T @ jacobian
+        normal = jacobian @ jacobian.T
         scaling = np.sqrt(np.diag(normal))
         if not scaling.all() or np.linalg.cond(normal / np.outer(scaling, scaling)) > 1e12:
             return None
-        step = -np.linalg.solve(normal, jacobian.T @ weighted)
+        step = -np.linalg.solve(normal, jacobian @ weighted)
         update = np.eye(4)
         update[:3, :3], update[:3, 3] = cv2.Rodrigues(step[3:])[0], step[:3]
         transform = update @ transform
