@@ -47,6 +47,8 @@ class EdgesConfig:
     def __post_init__(self) -> None:
         if not (0 <= self.reach_px <= 64 and 1 <= self.clear_px <= 64 and 0 <= self.window_px <= 64):
             raise ValueError("EdgesConfig.reach_px and window_px must lie in 0 ... 64, clear_px in 1 ... 64")
+        if not (self.colour > 0 and self.distance_px > 0):
+            raise ValueError("EdgesConfig.colour and distance_px must be positive")
         if not 0.5 <= self.majority <= 1:
             raise ValueError(f"EdgesConfig.majority must lie in 0.5 ... 1, got {self.majority}")
 

@@ -201,7 +201,10 @@ def propose(
     disparity, found = side_by_side(
         lambda: refill(match1, start.match2, grey, labels, homographies, matching, evidence), lost_objects
     )
-    state[D1] = disparity.ravel()[other_sides(disparity, frames.left1, edges)]
+    if edges.reach_px:
+        sides = disparity.ravel()[other_sides(disparity, frames.left1, edges)]
+        disparity = cv2.medianBlur(sides, 3)  # each pixel decided for itself
+    state[D1] = disparity
     motions += found
     labels, cost = fuse(2)
     return Proposal(state, labels, motions, cost)

@@ -105,7 +105,11 @@ def test_threads_and_inputs() -> None:
     np.testing.assert_array_equal(image, kept[1])
 
 
-@pytest.mark.parametrize("wrong", [{"reach_px": -1}, {"reach_px": 65}, {"clear_px": 0}, {"window_px": 65}, {"majority": 0.4}])
+@pytest.mark.parametrize(
+    "wrong",
+    [{"reach_px": -1}, {"reach_px": 65}, {"clear_px": 0}, {"window_px": 65}, {"colour": 0}, {"distance_px": 0},
+     {"majority": 0.4}],
+)
 def test_settings_out_of_range_are_refused(wrong: dict) -> None:
     with pytest.raises(ValueError, match="EdgesConfig"):
         EdgesConfig(**wrong)
