@@ -86,8 +86,9 @@ def plain(disparity: np.ndarray, image: np.ndarray, config: EdgesConfig) -> np.n
 
 
 @pytest.mark.parametrize("config", [EdgesConfig(), EdgesConfig(reach_px=3, clear_px=1, window_px=6, majority=0.6)])
-def test_it_equals_its_plain_twin(config: EdgesConfig) -> None:
-    wrong, image = fattened(2), painted(NEAR, noise=0.05)
+@pytest.mark.parametrize("by", [-2, 2])
+def test_it_equals_its_plain_twin(by: int, config: EdgesConfig) -> None:
+    wrong, image = fattened(by), painted(NEAR, noise=0.08)
     settled = settle_edges(wrong, image, config)
     assert (settled != wrong).sum() > 40
     np.testing.assert_allclose(settled, plain(wrong, image, config), atol=1e-4)
