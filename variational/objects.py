@@ -50,6 +50,8 @@ class ObjectsConfig:
         Patches of a surface that are looked for, at most.
     least_places : int
         Fewest of them that must be found again.
+    seen : float
+        Least share of them that must follow the first motion.
     flow_px : int
         Side of the square whose area dense inverse search reduces a surface and its surroundings to.
     least_points : int

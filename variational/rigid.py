@@ -215,32 +215,36 @@ def fit_motion(
     return _gauss_newton(transform, points, second, projection, iterations, 0.7 * tolerance_px)
 
 
+def _derivatives(points: np.ndarray, projection: np.ndarray) -> np.ndarray:
+    """(6, 3, N) derivatives of (x, y, disparity) of (N, 3) points by a twist from the left: translation (3), rotation (3)."""
+    fx, fy, fb = projection[0, 0], projection[1, 1], projection[2, 3]
+    X, Y, Z = points.T
+    x, y, inverse = X / Z, Y / Z, 1 / Z
+    jacobian = np.zeros((6, 3, len(points)))
+    jacobian[0, 0], jacobian[1, 1] = fx * inverse, fy * inverse
+    jacobian[2] = -fx * x * inverse, -fy * y * inverse, -fb * inverse**2
+    jacobian[3] = -fx * x * y, -fy * (1 + y**2), -fb * y * inverse
+    jacobian[4] = fx * (1 + x**2), fy * x * y, fb * x * inverse
+    jacobian[5, 0], jacobian[5, 1] = -fx * y, fy * x
+    return jacobian
+
+
 def _gauss_newton(
     transform: np.ndarray, points: np.ndarray, second: np.ndarray, projection: np.ndarray, iterations: int,
     scale_px: float,
 ) -> np.ndarray | None:  # fmt: skip
     """Minimise the Geman-McClure penalty of the distance in (x, y, disparity) over a twist from the left."""
-    fx, fy, fb = projection[0, 0], projection[1, 1], projection[2, 3]
     for _ in range(iterations):
         moved = points @ transform[:3, :3].T + transform[:3, 3]
-        X, Y, Z = moved.T
         with np.errstate(divide="ignore", invalid="ignore"):
             residual = _project(moved, projection) - second
             weight = 1 / (1 + (residual**2).sum(axis=1) / scale_px**2) ** 2
-            usable = (Z > 0) & np.isfinite(weight)
-        X, Y, Z, residual, weight = X[usable], Y[usable], Z[usable], residual[usable], weight[usable]
-        if len(Z) < 6:
+            usable = (moved[:, 2] > 0) & np.isfinite(weight)
+        residual, weight = residual[usable], weight[usable]
+        if len(weight) < 6:
             return None
-        # derivatives of (x, y, disparity) by translation (3) and rotation (3), one row an unknown
-        jacobian = np.zeros((6, 3, len(Z)))
-        x, y, inverse = X / Z, Y / Z, 1 / Z
-        jacobian[0, 0], jacobian[1, 1] = fx * inverse, fy * inverse
-        jacobian[2] = -fx * x * inverse, -fy * y * inverse, -fb * inverse**2
-        jacobian[3] = -fx * x * y, -fy * (1 + y**2), -fb * y * inverse
-        jacobian[4] = fx * (1 + x**2), fy * x * y, fb * x * inverse
-        jacobian[5, 0], jacobian[5, 1] = -fx * y, fy * x
         root = np.sqrt(weight)
-        jacobian = (jacobian * root).reshape(6, -1)
+        jacobian = (_derivatives(moved[usable], projection) * root).reshape(6, -1)
         weighted = (residual.T * root).ravel()
         normal = jacobian @ jacobian.T
         scaling = np.sqrt(np.diag(normal))

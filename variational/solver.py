@@ -213,7 +213,7 @@ def _solve_smaller(
     backward = cv2.resize(found.backward_flow, (width, height)) * np.array([width / columns, height / rows], np.float32)
     return replace(
         found,
-        state=state.reshape(5, -1)[:, source],
+        state=np.take(state.reshape(5, -1), source, axis=1),
         visible=enlarged(found.visible),
         confidence=cv2.resize(found.confidence, (width, height)),
         moving=None if found.moving is None else enlarged(found.moving).ravel()[source],

@@ -22,11 +22,16 @@ def _texture(rng: np.random.Generator, height: int, width: int) -> np.ndarray:
     return np.clip(0.5 + 0.12 * mixed, 0, 1).astype(np.float32)
 
 
-def two_layers(height: int = 72, width: int = 108, seed: int = 0) -> Layers:
-    """Background: disparity 5, flow (2, 1), no change. A box before it: disparity 13, flow (-4, 3), change +2."""
+def two_layers(height: int = 72, width: int = 108, seed: int = 0, apart: float = 0.0) -> Layers:
+    """Background: disparity 5, flow (2, 1), no change. A box before it: disparity 13, flow (-4, 3), change +2.
+
+    apart: how much brighter the box is; 1 leaves no texture.
+    """
     rng = np.random.default_rng(seed)
     margin = 24
-    textures = [_texture(rng, height + 2 * margin, width + 2 * margin) for _ in range(2)]
+    textures = [
+        ((1 - apart) * _texture(rng, height + 2 * margin, width + 2 * margin) + apart * k).astype(np.float32) for k in range(2)
+    ]
     box = np.zeros((height + 2 * margin, width + 2 * margin), bool)
     box[margin + height // 3 : margin + 3 * height // 4, margin + width // 3 : margin + 2 * width // 3] = True
     layers = ((5, 2, 1, 0), (13, -4, 3, 2))

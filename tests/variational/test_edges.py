@@ -97,10 +97,13 @@ def test_it_equals_its_plain_twin(by: int, config: EdgesConfig) -> None:
 def test_threads_and_inputs() -> None:
     wrong, image = fattened(2), painted(NEAR)
     kept = wrong.copy(), image.copy()
-    results = []
-    for threads in (1, 2):
-        numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
-        results.append(settle_edges(wrong, image, EdgesConfig()))
+    results, threads = [], numba.get_num_threads()
+    try:
+        for count in (1, min(2, threads)):
+            numba.set_num_threads(count)
+            results.append(settle_edges(wrong, image, EdgesConfig()))
+    finally:
+        numba.set_num_threads(threads)
     np.testing.assert_array_equal(*results)
     np.testing.assert_array_equal(wrong, kept[0])
     np.testing.assert_array_equal(image, kept[1])

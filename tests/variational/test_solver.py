@@ -10,6 +10,7 @@ from tests.variational.scenes import two_layers
 from variational.camera import StereoCamera
 from variational.confidence import confidence
 from variational.descent import DescentConfig
+from variational.edges import EdgesConfig
 from variational.frames import Frames
 from variational.minimise import DescendConfig
 from variational.solver import SolverConfig, solve
@@ -64,6 +65,17 @@ def test_fewer_pixels_give_the_same_scene_at_full_size():
     assert not np.array_equal(half.state, full.state)
     with pytest.raises(ValueError, match="most_pixels must not be negative"):
         SolverConfig(most_pixels=-1)
+
+
+@pytest.mark.parametrize("most", [0, 96 * 240 // 2])
+def test_pixels_beside_a_jump_take_the_side_of_their_colour(most):
+    scene = two_layers(96, 240, apart=0.5)
+    wrong = []
+    for reach in (0, 2):
+        state = solve(scene.frames, SolverConfig(most_pixels=most, edges=EdgesConfig(reach_px=reach)), CAMERA).state
+        assert state.flags.c_contiguous
+        wrong.append((np.abs(state[0] - scene.state[0]) > 3).mean())
+    assert wrong[1] < wrong[0]
 
 
 def test_a_small_image_is_not_shrunk_below_what_the_method_takes():
