@@ -80,18 +80,18 @@ def census(grey: np.ndarray) -> np.ndarray:
 
 
 @inlined
-def write_matching_costs(left: np.ndarray, right_mirrored: np.ndarray, y: int, x: int, costs: np.ndarray) -> None:
-    """Costs of the disparities of pixel (x, y), in differing bits; OUTSIDE_COST where the match lies outside.
+def write_matching_costs(left: np.ndarray, right_mirrored: np.ndarray, y: int, x: int, step: int, costs: np.ndarray) -> None:
+    """Costs of the disparities 0, step, 2 step, ... of pixel (x, y), in differing bits; OUTSIDE_COST outside.
 
     left, right_mirrored (2, H, W): words, the right image's from its right end, so that disparities follow in the order of
     memory. costs (H, W, D).
     """
     disparities = costs.shape[2]
-    reach = min(x + 1, disparities)
+    reach = min(x // step + 1, disparities)
     fine, wide = left[0, y, x], left[1, y, x]
     begin = left.shape[2] - 1 - x
     for d in range(reach):
-        at = np.uintp(begin + d)  # an index that may be negative, as numba sees it, is gathered word by word
+        at = np.uintp(begin + step * d)  # an index that may be negative, as numba sees it, is gathered word by word
         costs[y, x, d] = popcount(fine ^ right_mirrored[0, y, at]) + popcount(wide ^ right_mirrored[1, y, at])
     for d in range(reach, disparities):
         costs[y, x, d] = OUTSIDE_COST
@@ -102,7 +102,7 @@ def _matching_costs(first: int, last: int, left: np.ndarray, right_mirrored: np.
     width = costs.shape[1]
     for y in range(first, last):
         for x in range(width):
-            write_matching_costs(left, right_mirrored, y, x, costs)
+            write_matching_costs(left, right_mirrored, y, x, np.intp(1), costs)
 
 
 def stereo_costs(words_left: np.ndarray, words_right: np.ndarray, disparities: int) -> np.ndarray:

@@ -39,8 +39,11 @@ class EvidenceConfig:
         That comparison's cost where the motion leads out of the image or is not known.
     background_per_px, background_most : float
         Truncated pull towards the background.
+    step_px : int
+        Disparities that are compared lie so far apart; the best is fitted between them. What is filled in is known to about
+        two pixels at best.
     small_step : int
-        Penalty for a change of disparity by one pixel; larger than for matching, since here there is less to go by.
+        Penalty for a change of disparity by one step; larger than for matching, since here there is less to go by.
     """
 
     fill: bool = True
@@ -51,7 +54,12 @@ class EvidenceConfig:
     unknown_cost: float = 55.0
     background_per_px: float = 6.0
     background_most: float = 30.0
+    step_px: int = 2
     small_step: int = 100
+
+    def __post_init__(self) -> None:
+        if self.step_px < 1:
+            raise ValueError(f"EvidenceConfig.step_px must be at least 1, got {self.step_px}")
 
 
 @rowwise
@@ -84,28 +92,28 @@ def _inside(position: np.float32, size: np.int32) -> np.int32:
 def _add_evidence(
     row: np.ndarray, front: np.ndarray, known: np.float32, fine: np.uint64, wide: np.uint64, fine_left: np.ndarray,
     wide_left: np.ndarray, fine_right: np.ndarray, wide_right: np.ndarray, width: np.int32, height: np.int32,
-    start: tuple, step: tuple, hidden: np.float32, contradicted: np.float32, time_weight: np.float32,
+    start: tuple, per_px: tuple, step_px: np.int32, hidden: np.float32, contradicted: np.float32, time_weight: np.float32,
     unknown: np.float32, pull: np.float32, pull_most: np.float32,
 ) -> None:  # fmt: skip
     """Turn one pixel's matching costs (D,) into costs of all evidence.
 
-    fine_*, wide_* (H * W,): words at time 2. start, step: the place (x, y, disparity, 1) at time 2 is, but for its
-    scale, start + d * step. No branches and all in float32, so that disparities are worked on in vectors.
+    fine_*, wide_* (H * W,): words at time 2. start, per_px: the place (x, y, disparity, 1) at time 2 is, but for its
+    scale, start + disparity * per_px. No branches and all in float32, so that disparities are worked on in vectors.
     """
     one, half, zero = np.float32(1), np.float32(0.5), np.float32(0)
     margin, most = np.float32(1.5), np.float32(255)
     right_end, bottom, beyond = np.float32(width - 1), np.float32(height - 1), np.float32(width) - half
     for d in range(row.size):
-        fd = np.float32(np.int32(d))
-        stereo, seen = np.float32(row[d]), front[d]
+        disparity = step_px * np.int32(d)
+        fd, stereo, seen = np.float32(disparity), np.float32(row[d]), front[np.uintp(disparity)]
         nearer = stereo if stereo > contradicted else contradicted
         compared = hidden if fd < seen - margin else (nearer if fd > seen + margin else stereo)
         stereo = compared if seen >= zero else stereo
-        scale = start[3] + step[3] * fd
+        scale = start[3] + per_px[3] * fd
         ahead = scale > zero
         inverse = one / (scale if ahead else one)
-        to_x, to_y = (start[0] + step[0] * fd) * inverse, (start[1] + step[1] * fd) * inverse
-        in_right = to_x - (start[2] + step[2] * fd) * inverse
+        to_x, to_y = (start[0] + per_px[0] * fd) * inverse, (start[1] + per_px[1] * fd) * inverse
+        in_right = to_x - (start[2] + per_px[2] * fd) * inverse
         begin = _inside(to_y, height) * width
         at, at_right = begin + _inside(to_x, width), begin + _inside(in_right, width)
         bits = np.float32(np.int32(popcount(fine ^ fine_left[at]) + popcount(wide ^ wide_left[at])))
@@ -122,7 +130,7 @@ def _add_evidence(
 def _write_costs(
     first: int, last: int, disparity: np.ndarray, matched: np.ndarray, front: np.ndarray, words_left1: np.ndarray,
     right1_mirrored: np.ndarray, words_left2: np.ndarray, words_right2: np.ndarray, labels: np.ndarray,
-    homographies: np.ndarray, anchor: float, hidden: np.float32, contradicted: np.float32, time_weight: float,
+    homographies: np.ndarray, step_px: int, anchor: float, hidden: np.float32, contradicted: np.float32, time_weight: float,
     unknown: np.float32, pull: float, pull_most: float, costs: np.ndarray,
 ) -> None:  # fmt: skip
     """words_left2, words_right2: (2, H * W)."""
@@ -134,10 +142,11 @@ def _write_costs(
             row, known = costs[y, x], disparity[y, x]
             if matched[y, x]:
                 row[:] = np.uint8(255)
-                for d in range(max(int(known) - reach, 0), min(int(known) + reach + 1, disparities)):
-                    row[d] = np.uint8(min(abs(np.float32(d) - known) * anchor, most))
+                middle = int(known) // step_px
+                for d in range(max(middle - reach, 0), min(middle + reach + 1, disparities)):
+                    row[d] = np.uint8(min(abs(np.float32(step_px * d) - known) * anchor, most))
                 continue
-            write_matching_costs(words_left1, right1_mirrored, y, x, costs)
+            write_matching_costs(words_left1, right1_mirrored, y, x, step_px, costs)
             h, fx = homographies[max(labels[y, x], 0)], np.float32(x)
             start = (
                 h[0, 0] * fx + h[0, 1] * fy + h[0, 3], h[1, 0] * fx + h[1, 1] * fy + h[1, 3],
@@ -148,7 +157,8 @@ def _write_costs(
             _add_evidence(
                 row, front[y, width - 1 - x :], known, words_left1[0, y, x], words_left1[1, y, x], words_left2[0],
                 words_left2[1], words_right2[0], words_right2[1], np.int32(width), np.int32(height), start,
-                (h[0, 2], h[1, 2], h[2, 2], h[3, 2]), hidden, contradicted, time_weight, unknown, pull, pull_most,
+                (h[0, 2], h[1, 2], h[2, 2], h[3, 2]), np.int32(step_px), hidden, contradicted, time_weight, unknown, pull,
+                pull_most,
             )  # fmt: skip
 
 
@@ -174,16 +184,16 @@ def refill(
     np.ndarray
         (H, W) float32, pixels; matched pixels keep their disparity but for a median over 5 x 5.
     """
-    f = np.float32
-    costs = np.empty((*grey.shape, match1.max_disparity + 1), np.uint8)
-    front = np.empty((grey.shape[0], grey.shape[1] + costs.shape[2]), f)
+    f, step_px = np.float32, config.step_px
+    costs = np.empty((*grey.shape, match1.max_disparity // step_px + 1), np.uint8)
+    front = np.empty((grey.shape[0], grey.shape[1] + step_px * costs.shape[2]), f)
     over_rows(_front, len(front), match1.disparity, match1.matched, front)
     over_rows(
         _write_costs, len(costs), match1.disparity, match1.matched, front, match1.words_left,
         np.ascontiguousarray(match1.words_right[..., ::-1]), match2.words_left.reshape(2, -1),
         match2.words_right.reshape(2, -1), labels.astype(np.int32), homographies.astype(f),
-        f(config.anchor_per_px), f(config.hidden_cost), f(config.contradicted_cost), f(config.time_weight),
+        step_px, f(config.anchor_per_px), f(config.hidden_cost), f(config.contradicted_cost), f(config.time_weight),
         f(config.unknown_cost), f(config.background_per_px), f(config.background_most), costs,
     )  # fmt: skip
     filled, _ = aggregate(costs, grey, replace(matching, small_step=config.small_step))
-    return cv2.medianBlur(np.where(match1.matched, match1.disparity, filled), 5)
+    return cv2.medianBlur(np.where(match1.matched, match1.disparity, f(step_px) * filled), 5)

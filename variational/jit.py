@@ -42,6 +42,7 @@ import numpy as np
 from numba import config, get_num_threads, njit, set_num_threads, types
 from numba.core.compiler import CompilerBase, DefaultPassBuilder
 from numba.extending import overload
+from threadpoolctl import ThreadpoolController
 
 __all__ = ["band_edges", "inlined", "over_bands", "over_rows", "rowwise", "scalar", "side_by_side", "total"]
 
@@ -127,16 +128,24 @@ def over_bands(kernel: Callable[..., None], edges: Sequence[int], *arguments: An
             helper.result()
 
 
+@lru_cache(maxsize=1)
+def _products_of_matrices() -> ThreadpoolController:
+    """The library that numpy multiplies matrices with, and its threads; looking for it takes milliseconds."""
+    return ThreadpoolController().select(user_api="blas")
+
+
 def side_by_side(*tasks: Callable[[], Any]) -> list[Any]:
     """Results of functions that do not depend on one another, run at the same time on as many threads as numba may use.
 
-    For whole stages, whose serial parts then fill one another's waits. They share the threads out among them.
+    For whole stages, whose serial parts then fill one another's waits. They share the threads out among them, products of
+    matrices too: the threads of one idle on for a while after it, and would take time from the other stages.
     """
     threads = get_num_threads()
     if threads == 1:
         return [task() for task in tasks]
     share = max(1, threads // len(tasks))
-    with ThreadPoolExecutor(threads, "stages", initializer=set_num_threads, initargs=(share,)) as stages:
+    pool = ThreadPoolExecutor(threads, "stages", initializer=set_num_threads, initargs=(share,))
+    with _products_of_matrices().limit(limits=share), pool as stages:
         return list(stages.map(lambda task: task(), tasks))
 
 

@@ -49,7 +49,7 @@ def bits(words1, words2):
 
 
 def plain_costs(disparity, matched, words, labels, homographies, disparities, config):
-    """The kernel's twin, a pixel and a disparity at a time."""
+    """The kernel's twin, a pixel and a disparity at a time; all disparities, of which the kernel takes every so many-th."""
     (left1, right1, left2, right2), (height, width) = words, disparity.shape
     costs = np.empty((height, width, disparities))
     for y, x, d in np.ndindex(costs.shape):
@@ -82,7 +82,8 @@ def plain_costs(disparity, matched, words, labels, homographies, disparities, co
     return np.minimum(costs, 255)
 
 
-def test_costs_equal_their_plain_twin():
+@pytest.mark.parametrize("step_px", [1, 2, 3])
+def test_costs_equal_their_plain_twin(step_px):
     rng = np.random.default_rng(3)
     height, width, disparities = 7, 19, 9
     f, config = np.float32, EvidenceConfig(time_weight=0.8)
@@ -94,16 +95,18 @@ def test_costs_equal_their_plain_twin():
     homographies[:, :2, 3] = [(1.3, -0.6), (-2.2, 1.4)]
     homographies[1, 3, :3] = 0.004, 0.003, -0.05
     homographies = homographies.astype(f)
-    front, costs = np.empty((height, width + disparities), f), np.empty((height, width, disparities), np.uint8)
+    front = np.empty((height, width + disparities + step_px), f)
+    costs = np.empty((height, width, (disparities - 1) // step_px + 1), np.uint8)
     _front(0, len(front), disparity, matched, front)
     left1, right1, left2, right2 = words
     _write_costs(
         0, len(costs), disparity, matched, front, left1, np.ascontiguousarray(right1[..., ::-1]), left2.reshape(2, -1),
-        right2.reshape(2, -1), labels, homographies, f(config.anchor_per_px), f(config.hidden_cost), f(config.contradicted_cost),
-        f(config.time_weight), f(config.unknown_cost), f(config.background_per_px), f(config.background_most), costs,
+        right2.reshape(2, -1), labels, homographies, step_px, f(config.anchor_per_px), f(config.hidden_cost),
+        f(config.contradicted_cost), f(config.time_weight), f(config.unknown_cost), f(config.background_per_px),
+        f(config.background_most), costs,
     )  # fmt: skip
     expected = plain_costs(disparity, matched, words, labels, homographies.astype(float), disparities, config)
-    assert (np.abs(costs - expected) <= 1).all()  # the kernel rounds down
+    assert (np.abs(costs - expected[..., ::step_px]) <= 1).all()  # the kernel rounds down
 
 
 def test_matched_pixels_keep_their_disparity(scene):
@@ -119,3 +122,15 @@ def test_motions_out_of_the_image_leave_finite_disparities(scene, motion):
     assert ((result >= 0) & (result <= 31)).all()
     no_motion, _ = filled(scene, labels=-1)
     assert (result[HOLE] == no_motion[HOLE]).mean() > 0.9
+
+
+@pytest.mark.parametrize("step_px", [1, 2, 3])
+def test_steps_between_disparities_are_bridged(scene, step_px):
+    """The hole's disparity, 5, lies on the grid of one of these steps alone."""
+    result, _ = filled(scene, step_px=step_px)
+    assert np.median(np.abs(result[HOLE] - 5)) < 0.4 * step_px
+
+
+def test_a_step_of_nothing_is_refused():
+    with pytest.raises(ValueError, match="step_px must be at least 1"):
+        EvidenceConfig(step_px=0)

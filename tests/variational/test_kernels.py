@@ -4,10 +4,12 @@ import multiprocessing
 import time
 from concurrent.futures import ThreadPoolExecutor
 
+import numba
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_info
 
-from variational.jit import band_edges, over_bands, over_rows, rowwise, total
+from variational.jit import band_edges, over_bands, over_rows, rowwise, side_by_side, total
 from variational.penalties import penalty
 from variational.sampling import cell, interpolate
 from variational.terms.photometric import padded_planes, reflect, window_overlap
@@ -103,6 +105,23 @@ def test_an_error_in_any_band_reaches_the_caller():
 
 @pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="no fork here")
 @pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
+@pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="one thread has nothing to share")
+def test_stages_side_by_side_share_the_threads_also_for_products_of_matrices():
+    def products():
+        return [pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"]
+
+    before, threads = products(), numba.get_num_threads()
+    numba.set_num_threads(2)
+    try:
+        shares = side_by_side(*[lambda: (numba.get_num_threads(), products())] * 2)
+        with pytest.raises(ZeroDivisionError):
+            side_by_side(lambda: 1 / 0, products)
+    finally:
+        numba.set_num_threads(threads)
+    assert shares == [(1, [1] * len(before))] * 2
+    assert products() == before
+
+
 def test_a_forked_child_has_helpers_of_its_own():
     visits = np.zeros((300, 40), np.int32)
     over_rows(count, 300, visits)
