@@ -7,9 +7,8 @@ from concurrent.futures import ThreadPoolExecutor
 import numba
 import numpy as np
 import pytest
-from threadpoolctl import threadpool_info
 
-from variational.jit import band_edges, over_bands, over_rows, rowwise, side_by_side, total
+from variational.jit import _products_of_matrices, band_edges, over_bands, over_rows, rowwise, side_by_side, total
 from variational.penalties import penalty
 from variational.sampling import cell, interpolate
 from variational.terms.photometric import padded_planes, reflect, window_overlap
@@ -108,7 +107,7 @@ def test_an_error_in_any_band_reaches_the_caller():
 @pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="one thread has nothing to share")
 def test_stages_side_by_side_share_the_threads_also_for_products_of_matrices():
     def products():
-        return [pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"]
+        return [library["num_threads"] for library in _products_of_matrices().info()]
 
     before, threads = products(), numba.get_num_threads()
     numba.set_num_threads(2)
@@ -118,6 +117,7 @@ def test_stages_side_by_side_share_the_threads_also_for_products_of_matrices():
             side_by_side(lambda: 1 / 0, products)
     finally:
         numba.set_num_threads(threads)
+    assert before
     assert shares == [(1, [1] * len(before))] * 2
     assert products() == before
 
