@@ -8,6 +8,7 @@ about two minutes) with its arithmetic, and for the aggregation the speed-up ove
 import resource
 import sys
 from functools import cache
+from statistics import median
 from time import perf_counter
 
 import numba
@@ -108,17 +109,17 @@ def test_pass(benchmark, case):
 
 
 def seconds(case):
-    """The best of a few rounds, the last result and the GFLOP; the deep model runs once, warmed up at a small size."""
+    """The times of some rounds, the last result and the GFLOP; the deep model runs once, warmed up at a small size."""
     function = CASES[case]()
     work = 0.0 if "aggregation" in case else arithmetic(case, function)
     if "deep" not in case:
         function()
     times = []
-    for _ in range(ROUNDS.get(case, 5)):
+    for _ in range(ROUNDS.get(case, 12)):
         start = perf_counter()
         result = function()
         times.append(perf_counter() - start)
-    return min(times), result, work
+    return times, result, work
 
 
 def best_seconds(function, rounds=8):
@@ -167,10 +168,12 @@ def report(names):
     print(f"machine: {machine()}")
     times, disparities = {}, {}
     for name in names:
-        times[name], disparities[name], work = seconds(name)
+        each, disparities[name], work = seconds(name)
+        times[name] = min(each)
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
         rate = f"{work:.0f} GFLOP, {work / times[name]:.0f} GFLOP/s" if work else ""
-        print(f"{name:36} {1000 * times[name]:9.1f} ms   peak so far {peak:.2f} GB   {rate}", flush=True)
+        middle = f"(median {1000 * median(each):9.1f})" if len(each) > 2 else ""
+        print(f"{name:36} {1000 * times[name]:9.1f} ms {middle:18}  peak so far {peak:.2f} GB   {rate}", flush=True)
         fast, slow = name.removesuffix(", reference"), name
         if fast != slow and fast in times:
             print(f"{fast:36} {times[slow] / times[fast]:9.1f} times the reference", flush=True)
