@@ -138,7 +138,8 @@ def side_by_side(*tasks: Callable[[], Any]) -> list[Any]:
     """Results of functions that do not depend on one another, run at the same time on as many threads as numba may use.
 
     For whole stages, whose serial parts then fill one another's waits. They share the threads out among them, products of
-    matrices too: the threads of one idle on for a while after it, and would take time from the other stages.
+    matrices too: the threads of one idle on for a while after it, and would take time from the other stages. That bound holds
+    for the whole process until the last stage ends.
     """
     threads = get_num_threads()
     if threads == 1:

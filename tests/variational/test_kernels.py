@@ -102,8 +102,6 @@ def test_an_error_in_any_band_reaches_the_caller():
             over_bands(refuse, range(9), bad)
 
 
-@pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="no fork here")
-@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
 @pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="one thread has nothing to share")
 def test_stages_side_by_side_share_the_threads_also_for_products_of_matrices():
     def products():
@@ -122,6 +120,8 @@ def test_stages_side_by_side_share_the_threads_also_for_products_of_matrices():
     assert products() == before
 
 
+@pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="no fork here")
+@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
 def test_a_forked_child_has_helpers_of_its_own():
     visits = np.zeros((300, 40), np.int32)
     over_rows(count, 300, visits)
