@@ -8,7 +8,7 @@ image. The labelling minimises this along a tree at every pixel (rows first, the
 of Bleyer and Gelautz 2008), which dynamic programming does exactly in four sweeps.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import cv2
@@ -39,8 +39,6 @@ class FusionConfig:
         best counts.
     window : int
         Side of the window that costs are averaged over, pixels, odd.
-    first_step : int
-        The first choice, which only tells where evidence is to be looked for, is made for every so many-th row and column.
     motion_scale_px : float
         Difference of motion between neighbours at which they pay the full price.
     jump_cost : float
@@ -55,17 +53,12 @@ class FusionConfig:
     outside_cost: float = 0.4
     good_cost: float = 0.2
     window: int = 7
-    first_step: int = 2
     motion_scale_px: float = 10.0
     jump_cost: float = 3.0
     disparity_edge_px: float = 1.5
     intensity_edge: float = 0.08
     measured_prior: float = 0.2
     object_prior: float = 0.1
-
-    def __post_init__(self) -> None:
-        if self.first_step < 1:
-            raise ValueError(f"FusionConfig.first_step must be at least 1, got {self.first_step}")
 
 
 @rowwise
@@ -269,7 +262,7 @@ def motion_costs(
 
 
 def choose(
-    candidates: np.ndarray, costs: np.ndarray, disparity: np.ndarray, grey: np.ndarray, config: FusionConfig, step: int = 1
+    candidates: np.ndarray, costs: np.ndarray, disparity: np.ndarray, grey: np.ndarray, config: FusionConfig
 ) -> np.ndarray:
     """Label of the best candidate at each pixel.
 
@@ -279,20 +272,12 @@ def choose(
         (K, 3, H, W) and (K, H, W), see `motion_costs`, priors added.
     disparity, grey : np.ndarray
         (H, W), whose edges make jumps cheap.
-    step : int
-        Choose for every so many-th row and column; the pixels between follow. An edge has so many times fewer pixels then,
-        an area the square of that: jumps are cheaper by as much.
 
     Returns
     -------
     np.ndarray
         (H, W) int, in 0 ... K - 1.
     """
-    if step > 1:
-        height, width = grey.shape
-        a, b, c, d = (np.ascontiguousarray(each[..., ::step, ::step]) for each in (candidates, costs, disparity, grey))
-        labels = choose(a, b, c, d, replace(config, jump_cost=config.jump_cost / step))
-        return np.ascontiguousarray(labels.repeat(step, 0)[:height].repeat(step, 1)[:, :width])
     inverse_scale = np.float32(1 / config.motion_scale_px)
     turned = _transposed(costs)
     rows, trees = np.empty_like(turned), np.empty_like(costs)

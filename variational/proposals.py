@@ -175,7 +175,7 @@ def propose(
     state = start.state.copy()
     state[D1] = match1.disparity
 
-    def fuse(objects_near: int, step: int = 1) -> tuple[np.ndarray, np.ndarray]:
+    def fuse(objects_near: int) -> tuple[np.ndarray, np.ndarray]:
         """Labels and costs under the motions so far; writes the chosen motion to the state."""
         everywhere = np.array([MEASURED, 0])[:, None, None] + np.zeros_like(nothing)
         labels_of = np.concatenate([everywhere, _nearby(motions, objects_near)])
@@ -184,13 +184,12 @@ def propose(
         biased = costs.copy()
         biased[0] += fusion.measured_prior
         biased[2:] += fusion.object_prior
-        chosen = choose(candidates, biased, state[D1], grey, fusion, step)
-        labels, cost = np.empty_like(nothing), np.empty_like(grey)
+        chosen, labels, cost = choose(candidates, biased, state[D1], grey, fusion), np.empty_like(nothing), np.empty_like(grey)
         over_rows(_take, len(grey), chosen, candidates, labels_of, costs, state[C:], labels, cost)
         return labels, cost
 
     nothing = keep(start).labels
-    labels, cost = fuse(1, fusion.first_step if evidence.fill else 1)
+    labels, cost = fuse(1)
     if not evidence.fill:
         return Proposal(state, labels, motions, cost)
 

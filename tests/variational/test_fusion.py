@@ -58,25 +58,6 @@ def test_a_missing_candidate_is_never_chosen_and_threads_do_not_matter() -> None
     assert (results[0] == 1).any()
 
 
-def test_a_coarser_choice_finds_the_same_regions_at_odd_sizes_too() -> None:
-    """Two regions, each with one good candidate, and noise that the price of jumps must overcome at every step."""
-    rng = np.random.default_rng(5)
-    height, width = 47, 61
-    truth = np.zeros((height, width), int)
-    truth[10:36, 17:44] = 1
-    costs = np.stack([truth, 1 - truth]).astype(np.float32) * 0.3 + rng.random((2, height, width), np.float32)
-    candidates = np.zeros((2, 3, height, width), np.float32)
-    candidates[1, 1] = 9
-    disparity, grey = np.zeros((2, height, width), np.float32)
-    for step in (1, 2, 3):
-        labels = choose(candidates, costs, disparity, grey, FusionConfig(jump_cost=2), step)
-        assert labels.shape == truth.shape
-        assert (labels != truth).mean() < 0.02 * step
-        np.testing.assert_array_equal(labels, labels[::step, ::step].repeat(step, 0)[:height].repeat(step, 1)[:, :width])
-    with pytest.raises(ValueError, match="first_step must be at least 1"):
-        FusionConfig(first_step=0)
-
-
 def test_the_true_motion_is_chosen_and_outside_costs_a_constant() -> None:
     rng = np.random.default_rng(2)
     left1 = rng.random((40, 60), np.float32)
