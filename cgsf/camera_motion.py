@@ -6,7 +6,8 @@ import numpy as np
 
 from variational.camera import StereoCamera
 from variational.proposals import round_trips
-from variational.rigid import RigidConfig, find_motions, guess_camera
+from variational.rigid import RigidConfig, find_motions
+from variational.self_calibration import guess_camera
 from variational.state import D1, D2, flow_of
 
 # A quarter of the solver's points: six numbers are sought, among candidates that a step of the refiner weighs again.
@@ -25,7 +26,7 @@ def find_homography(state: np.ndarray, backward_flow: np.ndarray, camera: Stereo
     backward_flow : np.ndarray
         (H, W, 2), left2 -> left1, pixels.
     camera : StereoCamera, optional
-        Without one the focal length is that under which the points move most rigidly.
+        Without one, one is guessed: that under which the points move most rigidly.
 
     Returns
     -------

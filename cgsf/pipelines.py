@@ -219,6 +219,9 @@ def solve_variational(frames: Frames, config: Any, camera: StereoCamera | None, 
         height, width = frames.shape
         raise InputError(f"the images are too small ({width} x {height}): the solver needs {MIN_SIDE} pixels a side")
     solution = minimise(frames, config, camera, progress)
+    lens, guessed = solution.guessed_camera, {}
+    if lens:
+        guessed["guessed_camera"] = {"focal_px": lens.fx, "cx": lens.cx, "cy": lens.cy}
     initial = SceneFlow.from_state(solution.initial_state, np.ones(frames.shape, bool), method="initial state")
     return SceneFlow.from_state(
         solution.state,
@@ -228,7 +231,7 @@ def solve_variational(frames: Frames, config: Any, camera: StereoCamera | None, 
         camera_motion=solution.camera_motion,
         backward_flow=solution.backward_flow,
         seconds=dict(solution.seconds),
-        record={"reason": solution.reason, "history": solution.history},
+        record={"reason": solution.reason, "history": solution.history, **guessed},
         initial=initial,
     )
 

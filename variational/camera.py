@@ -43,6 +43,12 @@ class StereoCamera:
         """(4, 4) float64 matrix P with ``(x, y, disparity, 1) ~ P (X, Y, Z, 1)`` up to scale."""
         return np.array([[self.fx, 0, self.cx, 0], [0, self.fy, self.cy, 0], [0, 0, 0, self.fx * self.baseline_m], [0, 0, 1, 0]])
 
+    def homography(self, transform: np.ndarray) -> np.ndarray:
+        """(4, 4) what a rigid transform (4, 4) of points in metres does to (x, y, disparity, 1)."""
+        projection = self.projection()
+        homography: np.ndarray = projection @ transform @ np.linalg.inv(projection)
+        return homography
+
     def scaled(self, sx: float, sy: float) -> "StereoCamera":
         """The same camera on an image resized by (sx, sy), pixel centres at integers: ``x' = (x + 0.5) sx - 0.5``."""
         return StereoCamera(self.fx * sx, self.fy * sy, (self.cx + 0.5) * sx - 0.5, (self.cy + 0.5) * sy - 0.5, self.baseline_m)

@@ -20,7 +20,8 @@ from variational.jit import over_rows, rowwise, side_by_side
 from variational.matching import MatchingConfig, StereoMatch
 from variational.objects import ObjectsConfig, find_objects, unexplained_surfaces
 from variational.planes import PlanesConfig, plane_disparities
-from variational.rigid import Correspondences, RigidConfig, RigidMotion, displacements, find_motions, guess_camera
+from variational.rigid import Correspondences, RigidConfig, RigidMotion, displacements, find_motions
+from variational.self_calibration import guess_camera
 from variational.state import D1, C, flow_of
 from variational.visibility import project_visibility
 
@@ -42,12 +43,15 @@ class Proposal:
         The camera's first; empty where no rigid motion was found, and then nothing was changed.
     cost : np.ndarray
         (H, W) float32 in [0, 1]: how badly the census words agree where the chosen motion leads.
+    camera : StereoCamera or None
+        Whose motions they are, given or guessed; None without motions.
     """
 
     state: np.ndarray
     labels: np.ndarray
     motions: list[RigidMotion]
     cost: np.ndarray
+    camera: StereoCamera | None = None
 
 
 def keep(start: Start) -> Proposal:
@@ -191,7 +195,7 @@ def propose(
     nothing = keep(start).labels
     labels, cost = fuse(1)
     if not evidence.fill:
-        return Proposal(state, labels, motions, cost)
+        return Proposal(state, labels, motions, cost, known)
 
     def lost_objects() -> list[RigidMotion]:
         surfaces = unexplained_surfaces(state[D1], cost, project_visibility(state), start.match1.matched, objects)
@@ -207,7 +211,7 @@ def propose(
     state[D1] = disparity
     motions += found
     labels, cost = fuse(2)
-    return Proposal(state, labels, motions, cost)
+    return Proposal(state, labels, motions, cost, known)
 
 
 def _with_planes(match: StereoMatch, image: np.ndarray, config: PlanesConfig) -> StereoMatch:

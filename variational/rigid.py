@@ -5,19 +5,18 @@ rigid motion of what surrounds them is all there is. A motion T acts on (x, y, d
 ``P T P^-1``, P being the camera's projection (Demirdjian and Darrell 2001). Fits are robust: three-point RANSAC on the
 image motion, then iteratively re-weighted Gauss-Newton on image motion and disparity together.
 
-Without a calibration the principal point is taken at the image's centre, and the focal length is the one, of a few,
-under which the correspondences move most rigidly; the baseline is arbitrary, it only scales the translation.
+Without a calibration the camera is the one under which the correspondences move most rigidly
+(`variational.self_calibration`).
 """
 
 import logging
 from dataclasses import dataclass
-from functools import partial
 
 import cv2
 import numpy as np
 
 from variational.camera import StereoCamera
-from variational.jit import over_rows, rowwise, scalar, side_by_side
+from variational.jit import over_rows, rowwise, scalar
 
 logger = logging.getLogger(__name__)
 
@@ -172,7 +171,7 @@ def _continuous(
             out[y, x] = smooth
 
 
-def _project(points: np.ndarray, projection: np.ndarray) -> np.ndarray:
+def projected(points: np.ndarray, projection: np.ndarray) -> np.ndarray:
     """(N, 3) points in metres -> (N, 3) of x, y, disparity."""
     image = points @ projection[:, :3].T + projection[:, 3]
     return image[:, :3] / image[:, 3:]
@@ -199,7 +198,7 @@ def fit_motion(
     np.ndarray or None
         (4, 4) rigid transform; None where no three points agree with others or the points do not fix a motion.
     """
-    points = _project(first, np.linalg.inv(projection))
+    points = projected(first, np.linalg.inv(projection))
     camera_matrix = np.vstack([projection[:2, :3], [0, 0, 1]])
     try:
         found, rotation, translation, inliers = cv2.solvePnPRansac(
@@ -215,7 +214,7 @@ def fit_motion(
     return _gauss_newton(transform, points, second, projection, iterations, 0.7 * tolerance_px)
 
 
-def _derivatives(points: np.ndarray, projection: np.ndarray) -> np.ndarray:
+def rigid_derivatives(points: np.ndarray, projection: np.ndarray) -> np.ndarray:
     """(6, 3, N) derivatives of (x, y, disparity) of (N, 3) points by a twist from the left: translation (3), rotation (3)."""
     fx, fy, fb = projection[0, 0], projection[1, 1], projection[2, 3]
     X, Y, Z = points.T
@@ -229,6 +228,13 @@ def _derivatives(points: np.ndarray, projection: np.ndarray) -> np.ndarray:
     return jacobian
 
 
+def twist(step: np.ndarray) -> np.ndarray:
+    """(4, 4) rigid transform of a twist (6,): translation, then a vector of rotation."""
+    transform = np.eye(4)
+    transform[:3, :3], transform[:3, 3] = cv2.Rodrigues(step[3:])[0], step[:3]
+    return transform
+
+
 def _gauss_newton(
     transform: np.ndarray, points: np.ndarray, second: np.ndarray, projection: np.ndarray, iterations: int,
     scale_px: float,
@@ -237,23 +243,21 @@ def _gauss_newton(
     for _ in range(iterations):
         moved = points @ transform[:3, :3].T + transform[:3, 3]
         with np.errstate(divide="ignore", invalid="ignore"):
-            residual = _project(moved, projection) - second
+            residual = projected(moved, projection) - second
             weight = 1 / (1 + (residual**2).sum(axis=1) / scale_px**2) ** 2
             usable = (moved[:, 2] > 0) & np.isfinite(weight)
         residual, weight = residual[usable], weight[usable]
         if len(weight) < 6:
             return None
         root = np.sqrt(weight)
-        jacobian = (_derivatives(moved[usable], projection) * root).reshape(6, -1)
+        jacobian = (rigid_derivatives(moved[usable], projection) * root).reshape(6, -1)
         weighted = (residual.T * root).ravel()
         normal = jacobian @ jacobian.T
         scaling = np.sqrt(np.diag(normal))
         if not scaling.all() or np.linalg.cond(normal / np.outer(scaling, scaling)) > 1e12:
             return None
         step = -np.linalg.solve(normal, jacobian @ weighted)
-        update = np.eye(4)
-        update[:3, :3], update[:3, 3] = cv2.Rodrigues(step[3:])[0], step[:3]
-        transform = update @ transform
+        transform = twist(step) @ transform
     return transform
 
 
@@ -271,44 +275,16 @@ def fit_surface(
     return RigidMotion(transform, homography, surface) if np.sum(distance < 2 * tolerance_px) >= least else None
 
 
-def _thin(valid: np.ndarray, count: int) -> np.ndarray:
+def thin(valid: np.ndarray, count: int) -> np.ndarray:
     """(n,) flat indices of at most `count` of the set pixels, evenly spread."""
     indices = np.flatnonzero(valid)
     return indices[np.linspace(0, len(indices) - 1, count).astype(np.intp)] if len(indices) > count else indices
 
 
-def guess_camera(matches: Correspondences, config: RigidConfig, shape: tuple[int, int] | None = None) -> StereoCamera:
-    """A camera to fit rigid motions with where none is known; see the module's text.
-
-    `shape`: (H, W) of the image, if the correspondences are those of a part of its pixels.
-    """
-    height, width = shape or matches.valid.shape
-    centre = (width - 1) / 2, (height - 1) / 2
-    candidates = [StereoCamera(focal * width, focal * width, *centre, 0.1) for focal in (0.7, 1.0, 1.4, 2.0)]
-    chosen = _thin(matches.valid & (matches.first[..., 2] > 0.5), config.points)
-    if len(chosen) < config.min_points:
-        return candidates[1]
-    first, second = (m.reshape(-1, 3)[chosen].astype(np.float64) for m in (matches.first, matches.second))
-
-    def error(camera: StereoCamera) -> float:
-        transform = fit_motion(first, second, camera.projection())
-        if transform is None:
-            return np.inf
-        distance = np.linalg.norm(_apply(_homography(transform, camera), first) - second, axis=1)
-        return float(np.minimum(distance, config.tolerance_px).mean())
-
-    return candidates[int(np.argmin(side_by_side(*(partial(error, camera) for camera in candidates))))]
-
-
-def _homography(transform: np.ndarray, camera: StereoCamera) -> np.ndarray:
-    projection = camera.projection()
-    return projection @ transform @ np.linalg.inv(projection)
-
-
-def _apply(homography: np.ndarray, points: np.ndarray) -> np.ndarray:
+def apply_homography(homography: np.ndarray, points: np.ndarray) -> np.ndarray:
     """(N, 3) points in image-and-disparity space, moved."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        return _project(points, homography)
+        return projected(points, homography)
 
 
 def find_motions(matches: Correspondences, camera: StereoCamera, config: RigidConfig) -> list[RigidMotion]:
@@ -329,13 +305,13 @@ def find_motions(matches: Correspondences, camera: StereoCamera, config: RigidCo
     left = matches.valid & (matches.first[..., 2] > 0.5) & (matches.second[..., 2] > 0.5)
 
     def fit(region: np.ndarray, share: float) -> RigidMotion | None:
-        chosen = _thin(region, config.points)
+        chosen = thin(region, config.points)
         if len(chosen) < config.min_points:
             return None
         transform = fit_motion(first[chosen].astype(np.float64), second[chosen].astype(np.float64), projection)
         if transform is None:
             return None
-        homography = _homography(transform, camera)
+        homography = camera.homography(transform)
         support = np.empty(region.shape, bool)
         over_rows(_followers, len(left), homography, matches.first, matches.second, left, config.tolerance_px, support)
         if np.count_nonzero(support & region) < share * np.count_nonzero(region):

@@ -90,6 +90,8 @@ class Solution:
         (H, W) bool, True where a pixel does not follow the camera's motion; None where that is not known.
     camera_motion : np.ndarray or None
         (4, 4) float64, takes static points from left1's frame to left2's, metres; None without a calibration.
+    guessed_camera : StereoCamera or None
+        Without a calibration, the one that the motions were fitted with: its baseline is arbitrary.
     initial_state : np.ndarray
         (5, H, W), where the solver started.
     backward_flow : np.ndarray
@@ -107,6 +109,7 @@ class Solution:
     confidence: np.ndarray
     moving: np.ndarray | None
     camera_motion: np.ndarray | None
+    guessed_camera: StereoCamera | None
     initial_state: np.ndarray
     backward_flow: np.ndarray
     history: list[dict]
@@ -190,7 +193,8 @@ def solve(
         progress("done", 1.0)
     moving = proposal.labels != 0 if proposal.motions else None
     motion = proposal.motions[0].transform if proposal.motions and camera else None
-    return Solution(state, visible, trust, moving, motion, initial, backward, history, reason, seconds)
+    guessed = None if camera else proposal.camera
+    return Solution(state, visible, trust, moving, motion, guessed, initial, backward, history, reason, seconds)
 
 
 def _solve_smaller(
@@ -217,6 +221,7 @@ def _solve_smaller(
         visible=enlarged(found.visible),
         confidence=cv2.resize(found.confidence, (width, height)),
         moving=None if found.moving is None else enlarged(found.moving).ravel()[source],
+        guessed_camera=None if found.guessed_camera is None else found.guessed_camera.scaled(width / columns, height / rows),
         initial_state=enlarge_state(found.initial_state, frames.shape),
         backward_flow=backward,
         seconds={**found.seconds, "resizing": resizing + time.perf_counter() - begin},
