@@ -20,6 +20,8 @@ from numba.extending import intrinsic
 from variational.census import census, stereo_costs
 from variational.jit import inlined, over_bands, over_rows, rowwise, scalar
 
+EVIDENCE_SIDE = 9
+"""Side of the window that evidence is averaged over: about that of a census word."""
 UNREACHABLE = 12000
 """Above any path cost, and still inside 16 bits with a penalty added."""
 
@@ -41,6 +43,9 @@ class MatchingConfig:
     uniqueness : float
         A pixel is unmatched unless its second-best disparity (not a neighbour of the best) costs this much more, in
         bits over the eight paths; textureless areas have no such margin.
+    evidence : float
+        A pixel is unmatched unless the costs around it (9 x 9 pixels, each at its own disparity) lie this many bits below
+        those of the average disparity: what has no texture of its own only takes over what its neighbours have.
     speckle_px : int
         Matched regions of fewer pixels than this are unmatched.
     """
@@ -51,6 +56,7 @@ class MatchingConfig:
     edge_contrast: float = 0.12
     consistency_px: float = 1.0
     uniqueness: float = 40.0
+    evidence: float = 3.0
     speckle_px: int = 60
 
 
@@ -283,6 +289,42 @@ def aggregate(costs: np.ndarray, grey: np.ndarray, config: MatchingConfig) -> tu
 
 
 @rowwise
+def _evidence(first: int, last: int, costs: np.ndarray, disparity: np.ndarray, evidence: np.ndarray) -> None:
+    """evidence (H, W): by how many bits the cost at each pixel's disparity lies below the mean over all disparities."""
+    width, disparities = costs.shape[1:]
+    for y in range(first, last):
+        for x in range(width):
+            row, total = costs[y, x], np.int32(0)
+            for d in range(disparities):
+                total += np.int32(row[d])
+            at = min(max(int(np.rint(disparity[y, x])), 0), disparities - 1)
+            evidence[y, x] = np.float32(total) / np.float32(disparities) - np.float32(row[at])
+
+
+def has_evidence(costs: np.ndarray, disparity: np.ndarray, least: float) -> np.ndarray:
+    """Where the costs around a pixel speak for the disparities there; see `MatchingConfig.evidence`.
+
+    Parameters
+    ----------
+    costs : np.ndarray
+        (H, W, D) uint8, cost of each disparity 0 ... D - 1.
+    disparity : np.ndarray
+        (H, W) float32, pixels.
+    least : float
+        Bits.
+
+    Returns
+    -------
+    np.ndarray
+        (H, W) bool.
+    """
+    evidence = np.empty(disparity.shape, np.float32)
+    over_rows(_evidence, len(costs), costs, disparity, evidence)
+    around: np.ndarray = cv2.blur(evidence, (EVIDENCE_SIDE, EVIDENCE_SIDE)) >= least
+    return around
+
+
+@rowwise
 def _fill_rows(first: int, last: int, disparity: np.ndarray, known: np.ndarray, filled: np.ndarray) -> None:
     width = disparity.shape[1]
     for y in range(first, last):
@@ -341,5 +383,6 @@ def match(left: np.ndarray, right: np.ndarray, config: MatchingConfig) -> Stereo
     words_left, words_right = census(left), census(right)
     costs = stereo_costs(words_left, words_right, max(2, min(searched + 1, left.shape[1])))
     disparity, matched = aggregate(costs, left, config)
+    matched &= has_evidence(costs, disparity, config.evidence)
     filled = cv2.medianBlur(fill_background(disparity, matched), 5)
     return StereoMatch(filled, matched, words_left, words_right, searched)

@@ -7,7 +7,7 @@ import pytest
 
 from tests import naive_matching
 from variational.census import OUTSIDE_COST, census, stereo_costs
-from variational.matching import MatchingConfig, _aggregate, _large_steps, aggregate, fill_background, match
+from variational.matching import MatchingConfig, _aggregate, _large_steps, aggregate, fill_background, has_evidence, match
 
 SHAPE = (11, 17)
 
@@ -117,3 +117,29 @@ def test_background_fills_from_the_smaller_neighbour_and_empty_rows_from_the_nex
     filled = fill_background(disparity, disparity > 0)
     np.testing.assert_array_equal(filled, [[5, 5, 5, 5, 9, 9], [5, 5, 5, 5, 9, 9], [3, 3, 3, 3, 3, 3]])
     assert not fill_background(disparity, np.zeros(disparity.shape, bool)).any()
+
+
+def test_evidence_is_how_far_the_cost_lies_below_the_average_around() -> None:
+    rng = np.random.default_rng(5)
+    costs = rng.integers(0, 100, (20, 31, 7), np.uint8)
+    disparity = rng.uniform(-0.4, 6.4, (20, 31)).astype(np.float32)
+    own = np.empty(disparity.shape)
+    for y, x in np.ndindex(own.shape):
+        own[y, x] = costs[y, x].mean() - costs[y, x, round(float(disparity[y, x]))]
+    padded = np.pad(own, 4, "reflect")
+    around = np.array([[padded[y : y + 9, x : x + 9].mean() for x in range(31)] for y in range(20)])
+    for least in (-3.0, 0.0, 2.0):
+        clear = np.abs(around - least) > 1e-3
+        np.testing.assert_array_equal(has_evidence(costs, disparity, least)[clear], (around >= least)[clear])
+
+
+def test_what_has_no_texture_is_unmatched_though_its_outline_tells_a_disparity() -> None:
+    wide = texture((96, 208))
+    wide[30:66, 60:140] = 0.5
+    left, right = wide[:, :200], np.ascontiguousarray(wide[:, 8:])
+    found, kept = (match(left, right, MatchingConfig(31, evidence=least)) for least in (MatchingConfig.evidence, -1e9))
+    inside, textured = (slice(42, 54), slice(92, 120)), (slice(4, 22), slice(40, 150))
+    assert kept.matched[inside].mean() > 0.5
+    assert found.matched[inside].mean() < 0.1
+    assert found.matched[textured].mean() > 0.95
+    np.testing.assert_array_equal(found.disparity[textured], kept.disparity[textured])
