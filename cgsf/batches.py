@@ -89,7 +89,7 @@ def further_sources(recipe: Recipe) -> list[Source]:
         return []
     if recipe.cached_networks:
         raise InputError("further samples are for single networks and refiners, not for joint training from starts")
-    starts = recipe.further_starts if recipe.stage == "refiner" else ("",) * len(recipe.further)
+    starts = recipe.further_starts if recipe.stage in ("refiner", "selector") else ("",) * len(recipe.further)
     if len(starts) != len(recipe.further):
         raise InputError("each folder of further samples needs its further_starts")
     return [Source.open(*folders) for folders in zip(recipe.further, starts, strict=True)]

@@ -22,6 +22,7 @@ from learned.ganet import GANetConfig
 from learned.hybrid import NetworkName
 from learned.pwcnet import PWCNetConfig
 from learned.refiner import RefinerConfig
+from learned.selector import SelectorConfig
 from learned.training import TrainingConfig
 from variational.energy import EnergyConfig
 
@@ -32,12 +33,12 @@ NETWORKS = get_args(NetworkName)
 class Recipe:
     """One training run."""
 
-    stage: Literal["flow", "disparity", "refiner", "joint"]
-    """Which network; joint: both and the refiner together."""
+    stage: Literal["flow", "disparity", "refiner", "selector", "joint"]
+    """Which network; selector: a refiner that chooses; joint: both networks and the refiner together."""
     cache: str
     """Folder of the samples (`cgsf.sample_cache`)."""
     starts: str = ""
-    """Refiner: folder of the states that it starts from (`cgsf.start_cache`). Joint: what networks that are frozen
+    """Refiner, selector: folder of the states that it starts from (`cgsf.start_cache`). Joint: what networks that are frozen
     would say, in place of running them."""
     weights: str = ""
     """Begin with these (the name of ones that ship, or a .safetensors file) in place of random ones; joint: the
@@ -51,7 +52,7 @@ class Recipe:
     further: tuple[str, ...] = ()
     """Folders of further samples to train with, such as real ones with what a method says for truth."""
     further_starts: tuple[str, ...] = ()
-    """Refiner: the starts of each of those folders."""
+    """Refiner, selector: the starts of each of those folders."""
     further_share: float = 0.2
     """How often a sample is one of those."""
     batch: int = 4
@@ -59,6 +60,7 @@ class Recipe:
     pwcnet: PWCNetConfig = field(default_factory=PWCNetConfig)
     ganet: GANetConfig = field(default_factory=GANetConfig)
     refiner: RefinerConfig = field(default_factory=RefinerConfig)
+    selector: SelectorConfig = field(default_factory=SelectorConfig)
     energy: EnergyConfig = field(default_factory=EnergyConfig)
     """Refiner, joint: the energy that the refiner sees and that self-supervision lowers. At test time methods take the
     paper's, the default; another one is for ablations."""
@@ -69,7 +71,7 @@ class Recipe:
     reliability_weight: float = 1.0
     """Refiner, joint: weight of the loss that teaches it to tell right values from wrong ones, if it looks at neighbours."""
     steps_before: int = 0
-    """Refiner, joint: up to this many steps, drawn for each batch, are made before those that learn, so that it has seen
+    """Refiner, selector, joint: up to this many steps, drawn for each batch, are made before those that learn, so that it has seen
     its own results and does not spoil them when it is run for longer."""
     robust_px: float = 0.0
     """Errors far above this pull less (`learned.losses.robust`); 0 is the published loss of each stage."""

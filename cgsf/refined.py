@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from learned.feedforward import FeedforwardModule
     from learned.hybrid import Watch
     from learned.refiner import Refiner
+    from learned.selector import Selector
 
 
 #: The refiner that ships for each start; OpenCV's states are nearest to the solver's.
@@ -154,13 +155,14 @@ def load_networks(config: FeedforwardConfig) -> FeedforwardModule:
     return FeedforwardModule(load_network(config.disparity), load_network(config.motion), config.precision).eval()
 
 
-def load_refiner(name: str) -> Refiner:
+def load_refiner(name: str) -> Refiner | Selector:
     """A refiner from weights that ship or a file; `InputError` for anything else."""
     import torch
 
     from learned.refiner import Refiner
+    from learned.selector import Selector
 
     net: nn.Module = load_network(name)
-    if not isinstance(net, Refiner):
+    if not isinstance(net, Refiner | Selector):
         raise InputError(f"{name} holds the weights of a {type(net).__name__}, not of a refiner")
     return net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]

@@ -27,6 +27,7 @@ from learned.losses import disparity_loss, multiscale_motion_loss
 from learned.oracle import Oracle
 from learned.pwcnet import PWCNet
 from learned.refiner import Refiner
+from learned.selector import Selector, selection_loss
 from learned.state_losses import energy_loss, state_loss
 
 
@@ -167,6 +168,17 @@ def _refinement_states(recipe: Recipe, model: nn.Module, batch: Batch) -> Estima
     return Estimates(refined.states, refined.oracle)
 
 
+def _selection_loss(recipe: Recipe, model: nn.Module, batch: Batch) -> tuple[Tensor, dict[str, float]]:
+    selector, before = cast(Selector, model), int(torch.randint(recipe.steps_before + 1, ()))
+    with torch.no_grad():
+        state = refine(selector, batch, steps=before).states[-1]
+    return selection_loss(*selector.weigh(state, batch), _truth(batch), selector.config.least_jump_px), {}
+
+
+def _selection_states(recipe: Recipe, model: nn.Module, batch: Batch) -> Estimates:  # noqa: ARG001
+    return Estimates(refine(cast(Selector, model), batch).states)
+
+
 def _reliability_loss(
     refiner: Refiner, states: list[Tensor], reliabilities: list[Tensor | None], truth: Tensor
 ) -> Tensor:
@@ -190,6 +202,10 @@ def _disparity_network(recipe: Recipe) -> nn.Module:
 
 def _refiner_network(recipe: Recipe) -> nn.Module:
     return _planar(_begin_with(Refiner(recipe.refiner), recipe.weights))
+
+
+def _selector_network(recipe: Recipe) -> nn.Module:
+    return _planar(_begin_with(Selector(recipe.selector), recipe.weights))
 
 
 def _joint_network(recipe: Recipe) -> nn.Module:
@@ -223,6 +239,7 @@ STAGES = {
     "flow": Stage(_flow_network, _flow_loss, _flow_states, "F1"),
     "disparity": Stage(_disparity_network, _disparity_loss, _disparity_states, "D1"),
     "refiner": Stage(_refiner_network, _refinement_loss, _refinement_states, "SF"),
+    "selector": Stage(_selector_network, _selection_loss, _selection_states, "SF"),
     "joint": Stage(_joint_network, _refinement_loss, _refinement_states, "SF"),
 }
 

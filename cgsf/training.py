@@ -68,9 +68,10 @@ def train(recipe: Recipe, folder: str | Path, seconds: float = float("inf"), pro
     folder = Path(folder)
     if recipe.starts and recipe.stage == "joint" and not recipe.cached_networks:
         raise InputError('starts take the place of networks that are frozen, as training.frozen = ["feedforward"]')
-    if recipe.stage == "refiner" and not recipe.starts:
-        raise InputError("a refiner needs starts")
-    needs_starts = recipe.stage == "refiner" or recipe.cached_networks
+    refines = recipe.stage in ("refiner", "selector")
+    if refines and not recipe.starts:
+        raise InputError(f"a {recipe.stage} needs starts")
+    needs_starts = refines or recipe.cached_networks
     source = Source.open(recipe.cache, recipe.starts if needs_starts else "")
     batches = Batches(recipe, source, further_sources(recipe))
     if batches.count < 1:
@@ -90,7 +91,7 @@ def train(recipe: Recipe, folder: str | Path, seconds: float = float("inf"), pro
 
 def check_truth(recipe: Recipe, cache: SampleCache) -> None:
     """`InputError` if a recipe that learns from the truth gets samples without one."""
-    learns_from_truth = recipe.stage in ("flow", "disparity") or recipe.supervision != "energy"
+    learns_from_truth = recipe.stage in ("flow", "disparity", "selector") or recipe.supervision != "energy"
     if learns_from_truth and not np.isfinite(cache.truth[len(cache) - 1]).any():
         raise InputError(f'{recipe.cache}: no truth to learn from; refiner and joint can do with supervision = "energy"')
 

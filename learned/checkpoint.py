@@ -23,10 +23,12 @@ from learned.ganet import GANet, GANetConfig
 from learned.published import ganet_names, ganet_tensor, pwcnet_names, pwcnet_tensor
 from learned.pwcnet import PWCNet, PWCNetConfig
 from learned.refiner import Refiner, RefinerConfig
+from learned.selector import Selector, SelectorConfig
 
 _ARCHITECTURES: dict[str, tuple[type[nn.Module], type]] = {"ganet": (GANet, GANetConfig),
                                                            "pwcnet": (PWCNet, PWCNetConfig),
-                                                           "refiner": (Refiner, RefinerConfig)}
+                                                           "refiner": (Refiner, RefinerConfig),
+                                                           "selector": (Selector, SelectorConfig)}
 # Layers that the published classes declare and never run.
 _UNUSED = {"ganet": "cost_agg.deconv0b.", "pwcnet": "deconv2."}
 

@@ -15,6 +15,7 @@ from learned.feedforward import FeedforwardModule, join_state
 from learned.inputs import View
 from learned.oracle import Oracle
 from learned.refiner import Refiner
+from learned.selector import Selector
 
 #: Called after each evaluation with the step t, the state X_t, the energy's map and gradient there (None if not
 #: needed).
@@ -31,7 +32,7 @@ class Refinement(NamedTuple):
 
 
 def refine(
-    refiner: Refiner,
+    refiner: Refiner | Selector,
     batch: Batch,
     oracle: Oracle | None = None,
     steps: int | None = None,
@@ -44,7 +45,7 @@ def refine(
 
     Parameters
     ----------
-    refiner : Refiner
+    refiner : Refiner or Selector
     batch : Batch
         With a start; the backward flow (for the visible pixels of the energy) and the evidence belong to the start and
         are held fixed.

@@ -24,6 +24,7 @@ from learned.feedforward import Precision, mixed_precision
 from learned.hybrid import Watch, refine
 from learned.oracle import Oracle
 from learned.refiner import Refiner
+from learned.selector import Selector
 
 StrategyName = Literal["learned", "outputs", "parameters"]
 
@@ -50,7 +51,7 @@ class StrategyConfig:
         if self.steps < 0 or not (self.outputs_rate > 0 and self.parameters_rate > 0):
             raise ValueError("steps must not be negative, rates must be positive")
 
-    def count(self, refiner: Refiner | None) -> int:
+    def count(self, refiner: Refiner | Selector | None) -> int:
         """The number of steps."""
         return self.steps or {"outputs": 100, "parameters": 50, "learned": refiner.config.steps if refiner else 0}[self.strategy]
 
@@ -75,7 +76,7 @@ def _paper_energy(batch: Batch) -> Oracle:
 def apply_strategy(
     config: StrategyConfig,
     batch: Batch,
-    refiner: Refiner | None = None,
+    refiner: Refiner | Selector | None = None,
     networks: nn.Module | None = None,
     make_oracle: MakeOracle = _paper_energy,
     watch: Watch | None = None,
@@ -87,7 +88,7 @@ def apply_strategy(
     config : StrategyConfig
     batch : Batch
         With a start and its backward flow.
-    refiner : Refiner or None
+    refiner : Refiner, Selector or None
         Needed by learned.
     networks : nn.Module or None
         Needed by parameters: the networks that made the start, ``(left1, right1, left2, right2) -> (state, backward

@@ -11,7 +11,7 @@ from variational.solver import SolverConfig, solve
 
 CONFIGS = {
     "default": SolverConfig(),
-    "fast": SolverConfig(most_pixels=150_000),
+    "fast": SolverConfig(most_pixels=200_000),
 }
 
 

@@ -29,6 +29,7 @@ from learned.augment import AugmentConfig
 from learned.checkpoint import ModelCard, load, save
 from learned.pwcnet import PWCNet, PWCNetConfig
 from learned.refiner import COMPACT, Refiner
+from learned.selector import Selector, SelectorConfig
 from learned.training import TrainingConfig
 from tests.cgsf import scenes
 from tests.cgsf.test_caches import SMALL_GANET, SMALL_PWCNET, weights
@@ -60,7 +61,7 @@ def folder(tmp_path_factory):
 def recipe(folder, stage: str, **changes) -> Recipe:
     small = Recipe(
         stage, str(folder / "cache"), str(folder / "starts"), held_out=1, batch=2, refiner=SMALL_REFINER,
-        pwcnet=SMALL_PWCNET, ganet=SMALL_GANET,
+        selector=SelectorConfig(layers=((8, 1),)), pwcnet=SMALL_PWCNET, ganet=SMALL_GANET,
         augment=AugmentConfig(48, 64), training=TrainingConfig(steps=2, log_every=1, checkpoint_every=1, validate_every=2),
     )  # fmt: skip
     return dataclasses.replace(small, **changes)
@@ -101,7 +102,7 @@ def test_starts_are_those_of_the_method(folder):
     assert evidence.max() <= 1
 
 
-@pytest.mark.parametrize("stage", ["flow", "disparity", "refiner"])
+@pytest.mark.parametrize("stage", ["flow", "disparity", "refiner", "selector"])
 def test_every_stage_trains_and_exports(folder, tmp_path, stage):
     settings = recipe(folder, stage)
     numbers = train(settings, tmp_path / "run")
@@ -274,9 +275,10 @@ def test_another_recipe_does_not_continue_a_run(folder, tmp_path):
 
 
 @pytest.mark.parametrize("method", ["variational+refiner", "hybrid"])
-def test_an_untrained_refiner_leaves_the_solvers_state(tmp_path, method):
+@pytest.mark.parametrize("refiner", [Refiner(SMALL_REFINER), Selector(SelectorConfig(layers=((8, 1),)))])
+def test_an_untrained_refiner_leaves_the_solvers_state(tmp_path, method, refiner):
     """From `variational`, whatever the method's own start."""
-    save(Refiner(SMALL_REFINER), tmp_path / "r.safetensors", ModelCard("a test"))
+    save(refiner, tmp_path / "r.safetensors", ModelCard("a test"))
     images = scenes.plane(np.random.default_rng(0), 70, 100)
     settings = {"refiner": str(tmp_path / "r.safetensors"), "steps_picture": str(tmp_path / "s.png")}
     config = pipelines.with_settings(pipelines.load_config(method), settings | {"initial": "variational"})

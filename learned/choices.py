@@ -1,0 +1,183 @@
+"""Whole states that a pixel may take over from its surroundings, and what speaks for each of them.
+
+Beside a jump of disparity, and inside a window pane that shows something else than its frame, the right value is often that
+of a pixel nearby: the nearest or the farthest thing around. To tell which, each is followed into the other three images:
+how alike is what is seen there, would something else hide it, on which side are the pixels of the same colour?
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from learned.batch import Batch
+
+#: The state itself, the farthest and the nearest thing close by, and within a wider reach.
+CHOICES = 5
+
+_CLOSE_PX = 4
+_HOPS_PX = (-14, -7, 0, 7, 14)  # from one closest extreme to the next: a reach of 18 px
+_VOTERS_PX = range(-9, 10, 3)
+_VOTERS_MOST_PX = 9.3
+_VOTERS_COLOUR = 0.1  # mean difference of the channels from which a pixel has no vote
+_VOTERS_DISTANCE_PX = 6.0  # where a vote weighs 1 / e
+_GRADIENT, _COLOUR = 4.0, 4.0  # factors that bring differences into a range of about one
+_LEAST_JUMP_PX = 0.5
+
+
+class Choices(NamedTuple):
+    """What each pixel may choose between."""
+
+    states: Tensor
+    """(B, CHOICES, 5, H, W), pixels, the state itself first; D2, which lives on left2's grid, is the state's in all."""
+    sources: Tensor
+    """(B, CHOICES - 1, H, W) int64: the pixels that the others come from, as indices into the flat image."""
+
+    @property
+    def jump(self) -> Tensor:
+        """(B, H, W): between the nearest and the farthest disparity within the wider reach."""
+        return self.states[:, 4, 0] - self.states[:, 3, 0]
+
+
+def find_choices(state: Tensor) -> Choices:
+    """The choices of a state (B, 5, H, W)."""
+    close, wide = [], []
+    for sign in (-1, 1):
+        values = sign * state[:, :1]
+        source = _largest_close_by(values)
+        close.append(source)
+        wide.append(_largest_around(values, source))
+    sources = close + wide
+    states = [state] + [torch.cat([_take(state[:, :1], source), state[:, 1:2], _take(state[:, 2:], source)], 1) for source in sources]
+    return Choices(torch.stack(states, 1), torch.cat(sources, 1))
+
+
+def _largest_close_by(values: Tensor) -> Tensor:
+    """(B, 1, H, W) int64: the pixel of the largest value within reach, along rows first, then along columns."""
+    side = 2 * _CLOSE_PX + 1
+    along, source = F.max_pool2d(values, (1, side), 1, (0, _CLOSE_PX), return_indices=True)
+    _, row = F.max_pool2d(along, (side, 1), 1, (_CLOSE_PX, 0), return_indices=True)
+    return _take(source, row)
+
+
+def _largest_around(values: Tensor, sources: Tensor) -> Tensor:
+    """Among the sources (B, 1, H, W) of the pixels a few hops away, the one of the largest value."""
+    found = _take(values, sources)
+    around, around_sources = _Surroundings(found, _HOPS_PX[-1]), _Surroundings(sources.double(), _HOPS_PX[-1])
+    best, best_source = found, around_sources(0, 0)
+    for dy in _HOPS_PX:
+        for dx in _HOPS_PX:
+            value = around(dy, dx)
+            best_source = torch.where(value > best, around_sources(dy, dx), best_source)
+            best = torch.maximum(best, value)
+    return best_source.long()
+
+
+class _Surroundings:
+    """Maps (B, n, H, W) as seen from a few pixels away; the border's values repeat outside."""
+
+    def __init__(self, maps: Tensor, reach: int) -> None:
+        self.padded, self.reach = F.pad(maps, (reach,) * 4, mode="replicate"), reach
+
+    def __call__(self, dy: int, dx: int) -> Tensor:
+        """``maps(p + (dy, dx))``."""
+        height, width = (side - 2 * self.reach for side in self.padded.shape[-2:])
+        top, left = self.reach + dy, self.reach + dx
+        return self.padded[..., top : top + height, left : left + width]
+
+
+def _take(maps: Tensor, sources: Tensor) -> Tensor:
+    """(B, n, H, W) maps at the pixels (B, 1, H, W)."""
+    picked = sources.flatten(2).expand(-1, maps.shape[1], -1)
+    return maps.flatten(2).gather(2, picked).view(maps.shape)
+
+
+def describe(choices: Choices, batch: Batch) -> Tensor:
+    """What speaks for each choice (B, DESCRIPTION, H, W), float32, in a range of about one.
+
+    Parameters
+    ----------
+    choices : Choices
+    batch : Batch
+        Its images, and its evidence: confidence and visibility.
+    """
+    if batch.evidence is None or batch.evidence.shape[1] != 2:
+        raise ValueError("choosing needs the start's confidence and visibility")
+    left1, evidence = batch.images[:, 0], batch.evidence
+    state = choices.states[:, 0]
+    height, width = state.shape[-2:]
+    y = torch.arange(height, device=state.device, dtype=state.dtype)[:, None]
+    x = torch.arange(width, device=state.device, dtype=state.dtype)
+    seen = [torch.cat([image, *(_GRADIENT * each for each in _gradients(image))], 1) for image in batch.images.unbind(1)]
+    front = _front(state[:, 0])
+    parts = []
+    for choice in choices.states.unbind(1):
+        d1, _, change, u, v = choice.unbind(1)
+        for there, at_x, at_y in ((1, x - d1, y + 0 * v), (2, x + u, y + v), (3, x + u - d1 - change, y + v)):
+            difference = (_sample(seen[there], at_x, at_y) - seen[0]).abs()
+            parts += [_COLOUR * difference[:, :3].mean(1, keepdim=True).clamp(max=0.5),
+                      difference[:, 3:].sum(1, keepdim=True).clamp(max=1)]  # fmt: skip
+        hides = _sample(front[:, None], x - d1, y + 0 * v) - d1[:, None]
+        parts += [torch.asinh(hides / 2) / 2, (x - d1 < 0).to(state.dtype)[:, None]]
+    farthest, nearest = (choices.states[:, k, :1] for k in (1, 2))
+    for far, near in ((farthest, nearest), (choices.states[:, 3, :1], choices.states[:, 4, :1])):
+        jump = near - far
+        between = torch.where(jump > _LEAST_JUMP_PX, (state[:, :1] - far) / jump.clamp(min=_LEAST_JUMP_PX), 0.5)
+        parts += [torch.log1p(jump) / 2, between]
+    parts.append(evidence)
+    for source in choices.sources.split(1, 1):
+        away_y, away_x = source // width - y, source % width - x
+        colour = (_take(left1, source) - left1).abs().mean(1, keepdim=True)
+        parts += [away_y / (2 * _CLOSE_PX), away_x / (2 * _CLOSE_PX), _take(evidence[:, :1], source), _COLOUR * colour]
+    parts += [_GRADIENT * each for each in _gradients(left1)]
+    parts.append(2 * _votes(left1, state[:, :1], evidence[:, :1], (farthest + nearest) / 2) - 1)
+    return torch.cat(parts, 1)
+
+
+#: Channels of a description.
+DESCRIPTION = 8 * CHOICES + 2 * 2 + 2 + 4 * (CHOICES - 1) + 2 + 2
+
+
+def _gradients(image: Tensor) -> tuple[Tensor, Tensor]:
+    """(B, 1, H, W) derivatives of the mean of the channels along x and y."""
+    grey = _Surroundings(image.mean(1, keepdim=True), 1)
+    return (grey(0, 1) - grey(0, -1)) / 2, (grey(1, 0) - grey(-1, 0)) / 2
+
+
+def _sample(maps: Tensor, x: Tensor, y: Tensor) -> Tensor:
+    """(B, n, H, W) maps at (B, H, W) places, bilinearly; the border's values repeat outside."""
+    height, width = maps.shape[-2:]
+    places = torch.stack([x * (2 / max(width - 1, 1)) - 1, y * (2 / max(height - 1, 1)) - 1], -1)
+    return F.grid_sample(maps, places, mode="bilinear", padding_mode="border", align_corners=True)
+
+
+def _front(disparity: Tensor) -> Tensor:
+    """(B, H, W): the largest disparity that lands on each pixel of right1; 0 where none does."""
+    width = disparity.shape[-1]
+    columns = torch.arange(width, device=disparity.device)
+    lands = (columns - disparity).round().long().clamp(-1, width - 1) + 1  # what leaves the image goes into column 0
+    room = disparity.new_zeros((*disparity.shape[:-1], width + 1))
+    return room.scatter_reduce(-1, lands, disparity, "amax")[..., 1:]
+
+
+def _votes(image: Tensor, disparity: Tensor, confidence: Tensor, middle: Tensor) -> Tensor:
+    """(B, 2, H, W): share of the pixels around, by colour and distance, that lie in front of the middle of a jump; and of
+    the confident ones. See `variational.edges`."""
+    around = _Surroundings(torch.cat([image, disparity, confidence**2], 1), _VOTERS_PX[-1])
+    totals, fronts = torch.full_like(image[:, :2], 1e-6), torch.zeros_like(image[:, :2])
+    for dy in _VOTERS_PX:
+        for dx in _VOTERS_PX:
+            distance = math.hypot(dy, dx)
+            if distance > _VOTERS_MOST_PX:
+                continue
+            voter = around(dy, dx)
+            unlike = (voter[:, :3] - image).abs().mean(1, keepdim=True)
+            vote = (1 - unlike / _VOTERS_COLOUR).clamp(min=0) ** 2 * math.exp(-distance / _VOTERS_DISTANCE_PX)
+            votes = torch.cat([vote, vote * voter[:, 4:]], 1)
+            totals += votes
+            fronts += votes * (voter[:, 3:4] > middle)
+    return fronts / totals

@@ -1,0 +1,202 @@
+"""The selector: its choices and votes against plain twins, what it may change, what it learns from."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from learned.batch import Batch
+from learned.checkpoint import ModelCard, load, save
+from learned.choices import CHOICES, DESCRIPTION, _front, _votes, describe, find_choices
+from learned.hybrid import refine
+from learned.inputs import View
+from learned.selector import Selector, SelectorConfig, right, selection_loss
+
+HEIGHT, WIDTH = 29, 43
+SMALL = SelectorConfig(layers=((8, 1),))
+
+
+@pytest.fixture
+def state() -> torch.Tensor:
+    """Two layers, the nearer one a box that moves on its own; every pixel's values differ a little."""
+    generator = torch.Generator().manual_seed(0)
+    state = torch.zeros(2, 5, HEIGHT, WIDTH)
+    state[:, 0], state[:, 1], state[:, 3] = 4, 4, 1
+    state[:, 0, 8:20, 12:30], state[:, 2, 8:20, 12:30], state[:, 3, 8:20, 12:30] = 12, 1, -3
+    return state + 0.1 * torch.rand(state.shape, generator=generator)
+
+
+@pytest.fixture
+def batch(state: torch.Tensor) -> Batch:
+    generator = torch.Generator().manual_seed(1)
+    images = torch.rand((2, 4, 3, HEIGHT, WIDTH), generator=generator)
+    return Batch(images, start=state, evidence=torch.rand((2, 2, HEIGHT, WIDTH), generator=generator))
+
+
+def test_choices_are_whole_states_of_the_farthest_and_nearest_pixels(state):
+    kept = state.clone()
+    choices = find_choices(state)
+    torch.testing.assert_close(state, kept, rtol=0, atol=0)
+    assert choices.states.shape == (2, CHOICES, 5, HEIGHT, WIDTH)
+    torch.testing.assert_close(choices.states[:, 0], state, rtol=0, atol=0)
+    flat = state.flatten(2)
+    for b, y, x in [(0, 0, 0), (1, 28, 42), (0, 7, 11), (1, 14, 20), (0, 20, 33)]:
+        rows, columns = slice(max(y - 4, 0), y + 5), slice(max(x - 4, 0), x + 5)
+        around = state[b, 0, rows, columns]
+        assert choices.states[b, 1, 0, y, x] == around.min()
+        assert choices.states[b, 2, 0, y, x] == around.max()
+        rows, columns = slice(max(y - 18, 0), y + 19), slice(max(x - 18, 0), x + 19)
+        assert around.max() <= choices.states[b, 4, 0, y, x] <= state[b, 0, rows, columns].max()
+        assert around.min() >= choices.states[b, 3, 0, y, x] >= state[b, 0, rows, columns].min()
+        for k in range(1, CHOICES):
+            there = flat[b, :, choices.sources[b, k - 1, y, x]]
+            expected = torch.stack([there[0], state[b, 1, y, x], *there[2:]])
+            torch.testing.assert_close(choices.states[b, k, :, y, x], expected, rtol=0, atol=0)
+    inside = choices.states[0, 4, 0, 14, 8:34]  # the box is within 18 px of all of these
+    assert (inside > 11).all()
+    assert (choices.jump >= 0).all()
+
+
+def test_a_choice_that_the_images_confirm_looks_alike_everywhere():
+    """left1 shifted by (D, F, D + C): the true state has no differences, a wrong one has."""
+    noise = torch.rand((1, 3, HEIGHT, WIDTH + 60), generator=torch.Generator().manual_seed(2))
+    wide = torch.nn.functional.avg_pool2d(noise, 3, 1, 1)
+    d1, u, change = 6, 3, 2
+
+    def view(shift: int) -> torch.Tensor:  # view(x - shift) shows what left1 shows at x
+        return wide[..., 30 + shift : 30 + shift + WIDTH]
+
+    images = torch.stack([view(0), view(d1), view(-u), view(-u + d1 + change)], 1)
+    state = torch.zeros(1, 5, HEIGHT, WIDTH)
+    state[:, 0], state[:, 2], state[:, 3] = d1, change, u
+    evidence = torch.ones(1, 2, HEIGHT, WIDTH)
+    seen = describe(find_choices(state), Batch(images, evidence=evidence))
+    assert seen.shape == (1, DESCRIPTION, HEIGHT, WIDTH)
+    inner = seen[..., 2:-2, 12:-12]
+    assert inner[:, :6].abs().max() < 1e-4  # the state's own differences: right1, left2, right2
+    for channel, shift in ((0, 2), (3, 1), (2, 1)):
+        wrong = state.clone()
+        wrong[:, channel] += shift
+        differs = describe(find_choices(wrong), Batch(images, evidence=evidence))[..., 2:-2, 12:-12]
+        assert differs[:, :6].amax() > 0.2
+
+
+def test_the_nearest_thing_hides_what_lands_behind_it():
+    disparity = torch.zeros(1, 1, 12)
+    disparity[0, 0] = torch.tensor([5.0, 1, 1, 1, 6, 1, 1, 1, 1, 1, 1, 3])
+    front = _front(disparity)[0, 0]
+    # 5 leaves the image; x = 4 with 6 too; x = 11 lands on 8, where x = 9 lands too
+    assert front.tolist() == [1, 1, 1, 0, 1, 1, 1, 1, 3, 1, 0, 0]
+
+
+def test_votes_equal_their_plain_twin(batch):
+    image, disparity, confidence = batch.images[:1, 0], batch.start[:1, :1], batch.evidence[:1, :1]
+    image = 0.5 + 0.1 * image
+    middle = torch.full_like(disparity, 7.0)
+    found = _votes(image, disparity, confidence, middle)
+    for y, x in [(0, 0), (28, 42), (14, 11), (7, 30)]:
+        totals, fronts = np.full(2, 1e-6), np.zeros(2)
+        for dy in range(-9, 10, 3):
+            for dx in range(-9, 10, 3):
+                if np.hypot(dy, dx) > 9.3:
+                    continue
+                at = min(max(y + dy, 0), HEIGHT - 1), min(max(x + dx, 0), WIDTH - 1)
+                unlike = float((image[0, :, at[0], at[1]] - image[0, :, y, x]).abs().mean())
+                vote = max(1 - unlike / 0.1, 0) ** 2 * np.exp(-np.hypot(dy, dx) / 6)
+                weights = vote * np.array([1, float(confidence[0, 0, at[0], at[1]]) ** 2])
+                totals += weights
+                fronts += weights * bool(disparity[0, 0, at[0], at[1]] > 7)
+        np.testing.assert_allclose(found[0, :, y, x].numpy(), fronts / totals, rtol=1e-4)
+
+
+def test_untrained_it_changes_nothing_and_needs_evidence(batch):
+    states = refine(Selector(SMALL), batch).states
+    assert len(states) == 3
+    torch.testing.assert_close(states[-1], batch.start, rtol=0, atol=0)
+    with pytest.raises(ValueError, match="confidence"):
+        Selector(SMALL)(View(batch.start), dataclasses.replace(batch, evidence=None))
+
+
+def test_what_it_is_sure_of_is_taken_where_there_is_a_jump(batch):
+    selector = Selector(SMALL)
+    with torch.no_grad():
+        selector.logits.bias.copy_(torch.tensor([0.0, 0, 4, 0, 0]))
+    changed = batch.start + selector(View(batch.start), batch).change
+    choices = find_choices(batch.start)
+    jumps = (choices.jump > 1)[:, None].expand_as(changed)
+    torch.testing.assert_close(changed[jumps], choices.states[:, 2][jumps])
+    torch.testing.assert_close(changed[~jumps], batch.start[~jumps], rtol=0, atol=0)
+    unsure = Selector(dataclasses.replace(SMALL, sure=0.96))
+    unsure.load_state_dict(selector.state_dict())
+    assert unsure(View(batch.start), batch).change.abs().max() == 0
+
+
+def test_right_by_kittis_limits_and_unknown_is_no_error():
+    truth = torch.full((1, 5, 1, 4), torch.nan)
+    truth[0, 0] = torch.tensor([[10.0, 100, 10, 10]])
+    truth[0, 3:, 0, 2:] = torch.tensor([[2.0, 2], [0, 0]])
+    states = torch.zeros(1, 2, 5, 1, 4)
+    states[:, :, 0] = torch.tensor([[13.5, 104.0, 10, 10], [12.5, 106.0, 10, 10]])[:, None]
+    states[0, :, 3, 0, 2:] = torch.tensor([[2.0, 6], [4, 2]])
+    whole, disparity = right(states, truth)
+    assert disparity[0].tolist() == [[[False, True, True, True]], [[True, False, True, True]]]
+    assert whole[0].tolist() == [[[False, True, True, False]], [[True, False, True, True]]]
+
+
+def test_loss_is_the_probability_of_what_is_right(state):
+    choices = find_choices(state)
+    truth = state.clone()
+    truth[:, :, 9, 11] = choices.states[:, 2, :, 9, 11]  # beside the box: it reaches farther
+    truth[:, 0, 20:] = torch.nan
+    logits = torch.zeros(2, CHOICES, HEIGHT, WIDTH, requires_grad=True)
+    loss = selection_loss(logits, choices, truth, 1.0)
+    whole, _ = right(choices.states, truth)
+    counts = whole.any(1) & ~whole.all(1) & (choices.jump > 1) & torch.isfinite(truth[:, 0])
+    expected = -(whole.sum(1)[counts] / CHOICES).log().mean()
+    torch.testing.assert_close(loss, expected)
+    loss.backward()
+    assert torch.isfinite(logits.grad).all()
+    assert logits.grad[0, 2, 9, 11] < 0 < logits.grad[0, 0, 9, 11]
+    assert logits.grad[:, :, 20:].abs().max() == 0
+    sky = truth.clone()
+    sky[:, 0] = 0
+    assert selection_loss(logits, choices, sky, 1.0) == 0
+
+
+def test_it_learns_to_mend_an_outline(batch):
+    truth = batch.start.clone()
+    state = truth.clone()
+    state[:, :, 8:20, 28:30] = state[:, :, 8:20, 31:33]  # the box lost its right end
+    images = batch.images.clone()
+    images[:, :, :, 8:20, 12:30] *= 0.3  # dark, as the end that is lost
+    spoilt = dataclasses.replace(batch, images=images, start=state)
+    torch.manual_seed(0)
+    selector = Selector(SelectorConfig(layers=((16, 1), (16, 1)), steps=1))
+    optimizer = torch.optim.Adam(selector.parameters(), 1e-2)
+    for _ in range(150):
+        loss = selection_loss(*selector.weigh(state, spoilt), truth, 1.0)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    with torch.no_grad():
+        mended = refine(selector, spoilt).states[-1]
+
+    def wrong(found: torch.Tensor) -> int:
+        return int(((found[:, 0] - truth[:, 0]).abs() > 3).sum())
+
+    assert wrong(mended) < 0.3 * wrong(state)
+
+
+def test_weights_keep_their_configuration(tmp_path):
+    selector = Selector(dataclasses.replace(SMALL, sure=0.7, steps=1))
+    save(selector, tmp_path / "s.safetensors", ModelCard("a test"))
+    again, _ = load(tmp_path / "s.safetensors")
+    assert isinstance(again, Selector)
+    assert again.config == selector.config
+
+
+@pytest.mark.parametrize("wrong", [{"layers": ()}, {"steps": -1}, {"sure": 1.5}])
+def test_nonsense_is_refused(wrong):
+    with pytest.raises(ValueError, match="must"):
+        SelectorConfig(**wrong)
