@@ -175,7 +175,7 @@ def _selection_loss(recipe: Recipe, model: nn.Module, batch: Batch) -> tuple[Ten
     return selection_loss(*selector.weigh(state, batch), _truth(batch), selector.config.least_jump_px), {}
 
 
-def _selection_states(recipe: Recipe, model: nn.Module, batch: Batch) -> Estimates:  # noqa: ARG001
+def _selection_states(recipe: Recipe, model: nn.Module, batch: Batch) -> Estimates:
     return Estimates(refine(cast(Selector, model), batch).states)
 
 

@@ -51,8 +51,10 @@ def find_choices(state: Tensor) -> Choices:
         source = _largest_close_by(values)
         close.append(source)
         wide.append(_largest_around(values, source))
-    sources = close + wide
-    states = [state] + [torch.cat([_take(state[:, :1], source), state[:, 1:2], _take(state[:, 2:], source)], 1) for source in sources]
+    states, sources = [state], close + wide
+    for source in sources:
+        there = _take(state, source)
+        states.append(torch.cat([there[:, :1], state[:, 1:2], there[:, 2:]], 1))
     return Choices(torch.stack(states, 1), torch.cat(sources, 1))
 
 
