@@ -71,8 +71,8 @@ class Recipe:
     reliability_weight: float = 1.0
     """Refiner, joint: weight of the loss that teaches it to tell right values from wrong ones, if it looks at neighbours."""
     steps_before: int = 0
-    """Refiner, selector, joint: up to this many steps, drawn for each batch, are made before those that learn, so that it has seen
-    its own results and does not spoil them when it is run for longer."""
+    """Refiner, selector, joint: up to this many steps, drawn for each batch, are made before those that learn, so that it has
+    seen its own results and does not spoil them when it is run for longer."""
     robust_px: float = 0.0
     """Errors far above this pull less (`learned.losses.robust`); 0 is the published loss of each stage."""
     augment: AugmentConfig = field(default_factory=AugmentConfig)
