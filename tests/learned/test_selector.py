@@ -75,6 +75,7 @@ def test_a_choice_that_the_images_confirm_looks_alike_everywhere():
     assert seen.shape == (1, DESCRIPTION, HEIGHT, WIDTH)
     inner = seen[..., 2:-2, 12:-12]
     assert inner[:, :6].abs().max() < 1e-4  # the state's own differences: right1, left2, right2
+    assert inner[:, 6:8].abs().max() < 1e-4  # nothing hides it, and it leads inside
     for channel, shift in ((0, 2), (3, 1), (2, 1)):
         wrong = state.clone()
         wrong[:, channel] += shift
@@ -159,9 +160,11 @@ def test_loss_is_the_probability_of_what_is_right(state):
     assert torch.isfinite(logits.grad).all()
     assert logits.grad[0, 2, 9, 11] < 0 < logits.grad[0, 0, 9, 11]
     assert logits.grad[:, :, 20:].abs().max() == 0
-    sky = truth.clone()
-    sky[:, 0] = 0
-    assert selection_loss(logits, choices, sky, 1.0) == 0
+    low, sky = state.clone(), truth.clone()
+    low[:, 0] -= 3  # so that the farthest choices are right about the sky
+    sky[:, 0], sky[:, 2:] = 0, torch.nan
+    assert right(find_choices(low).states, sky)[0].any()
+    assert selection_loss(logits, find_choices(low), sky, 1.0) == 0
 
 
 def test_it_learns_to_mend_an_outline(batch):
