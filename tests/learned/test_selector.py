@@ -122,13 +122,13 @@ def test_untrained_it_changes_nothing_and_needs_evidence(batch):
 def test_what_it_is_sure_of_is_taken_where_there_is_a_jump(batch):
     selector = Selector(SMALL)
     with torch.no_grad():
-        selector.logits.bias.copy_(torch.tensor([0.0, 0, 4, 0, 0]))
+        selector.logits.bias.copy_(torch.tensor([0.0, 0, 5, 0, 0]))
     changed = batch.start + selector(View(batch.start), batch).change
     choices = find_choices(batch.start)
     jumps = (choices.jump > 1)[:, None].expand_as(changed)
     torch.testing.assert_close(changed[jumps], choices.states[:, 2][jumps])
     torch.testing.assert_close(changed[~jumps], batch.start[~jumps], rtol=0, atol=0)
-    unsure = Selector(dataclasses.replace(SMALL, sure=0.96))
+    unsure = Selector(dataclasses.replace(SMALL, sure=0.98))
     unsure.load_state_dict(selector.state_dict())
     assert unsure(View(batch.start), batch).change.abs().max() == 0
 
@@ -154,7 +154,8 @@ def test_loss_is_the_probability_of_what_is_right(state):
     loss = selection_loss(logits, choices, truth, 1.0)
     whole, _ = right(choices.states, truth)
     counts = whole.any(1) & ~whole.all(1) & (choices.jump > 1) & torch.isfinite(truth[:, 0])
-    expected = -(whole.sum(1)[counts] / CHOICES).log().mean()
+    weight = torch.where(whole[:, 0], 1.0, 5.0)[counts]
+    expected = -((whole.sum(1)[counts] / CHOICES).log() * weight).sum() / weight.sum()
     torch.testing.assert_close(loss, expected)
     loss.backward()
     assert torch.isfinite(logits.grad).all()
