@@ -70,6 +70,10 @@ class Selector(nn.Module):
             layers += [nn.Conv2d(channels, width, 3, padding=dilation, dilation=dilation), nn.ReLU(inplace=True)]
             channels = width
         self.hidden = nn.Sequential(*layers)
+        for module in self.hidden:
+            if isinstance(module, nn.Conv2d):
+                nn.init.kaiming_normal_(module.weight, nonlinearity="relu")
+                nn.init.zeros_(module.bias)  # type: ignore[arg-type]
         self.logits = nn.Conv2d(channels, CHOICES, 1)
         nn.init.zeros_(self.logits.weight)
         nn.init.zeros_(self.logits.bias)  # type: ignore[arg-type]
