@@ -1,8 +1,8 @@
 """Whole states that a pixel may take over from its surroundings, and what speaks for each of them.
 
-Beside a jump of disparity, and inside a window pane that shows something else than its frame, the right value is often that
-of a pixel nearby: the nearest or the farthest thing around. To tell which, each is followed into the other three images:
-how alike is what is seen there, would something else hide it, on which side are the pixels of the same colour?
+Beside a jump of disparity the right value is often that of a pixel close by: of the nearest or the farthest thing there. To
+tell which, each is followed into the other three images: how alike is what is seen there, would something else hide it, on
+which side are the pixels of the same colour?
 """
 
 from __future__ import annotations
@@ -16,11 +16,10 @@ from torch import Tensor
 
 from learned.batch import Batch
 
-#: The state itself, the farthest and the nearest thing close by, and within a wider reach.
-CHOICES = 5
+#: The state itself, the farthest and the nearest thing close by.
+CHOICES = 3
 
 _CLOSE_PX = 4
-_HOPS_PX = (-14, -7, 0, 7, 14)  # from one closest extreme to the next: a reach of 18 px
 _VOTERS_PX = range(-9, 10, 3)
 _VOTERS_MOST_PX = 9.3
 _VOTERS_COLOUR = 0.1  # mean difference of the channels from which a pixel has no vote
@@ -39,19 +38,14 @@ class Choices(NamedTuple):
 
     @property
     def jump(self) -> Tensor:
-        """(B, H, W): between the nearest and the farthest disparity within the wider reach."""
-        return self.states[:, 4, 0] - self.states[:, 3, 0]
+        """(B, H, W): between the nearest and the farthest disparity close by."""
+        return self.states[:, 2, 0] - self.states[:, 1, 0]
 
 
 def find_choices(state: Tensor) -> Choices:
     """The choices of a state (B, 5, H, W)."""
-    close, wide = [], []
-    for sign in (-1, 1):
-        values = sign * state[:, :1]
-        source = _largest_close_by(values)
-        close.append(source)
-        wide.append(_largest_around(values, source))
-    states, sources = [state], close + wide
+    sources = [_largest_close_by(sign * state[:, :1]) for sign in (-1, 1)]
+    states = [state]
     for source in sources:
         there = _take(state, source)
         states.append(torch.cat([there[:, :1], state[:, 1:2], there[:, 2:]], 1))
@@ -64,19 +58,6 @@ def _largest_close_by(values: Tensor) -> Tensor:
     along, source = F.max_pool2d(values, (1, side), 1, (0, _CLOSE_PX), return_indices=True)
     _, row = F.max_pool2d(along, (side, 1), 1, (_CLOSE_PX, 0), return_indices=True)
     return _take(source, row)
-
-
-def _largest_around(values: Tensor, sources: Tensor) -> Tensor:
-    """Among the sources (B, 1, H, W) of the pixels a few hops away, the one of the largest value."""
-    found = _take(values, sources)
-    around, around_sources = _Surroundings(found, _HOPS_PX[-1]), _Surroundings(sources.double(), _HOPS_PX[-1])
-    best, best_source = found, around_sources(0, 0)
-    for dy in _HOPS_PX:
-        for dx in _HOPS_PX:
-            value = around(dy, dx)
-            best_source = torch.where(value > best, around_sources(dy, dx), best_source)
-            best = torch.maximum(best, value)
-    return best_source.long()
 
 
 class _Surroundings:
@@ -126,10 +107,9 @@ def describe(choices: Choices, batch: Batch) -> Tensor:
         hides = _sample(front[:, None], x - d1, y + 0 * v) - d1[:, None]
         parts += [torch.asinh(hides / 2) / 2, (x - d1 < 0).to(state.dtype)[:, None]]
     farthest, nearest = (choices.states[:, k, :1] for k in (1, 2))
-    for far, near in ((farthest, nearest), (choices.states[:, 3, :1], choices.states[:, 4, :1])):
-        jump = near - far
-        between = torch.where(jump > _LEAST_JUMP_PX, (state[:, :1] - far) / jump.clamp(min=_LEAST_JUMP_PX), 0.5)
-        parts += [torch.log1p(jump) / 2, between]
+    jump = choices.jump[:, None]
+    between = torch.where(jump > _LEAST_JUMP_PX, (state[:, :1] - farthest) / jump.clamp(min=_LEAST_JUMP_PX), 0.5)
+    parts += [torch.log1p(jump) / 2, between]
     parts.append(evidence)
     for source in choices.sources.split(1, 1):
         away_y, away_x = source // width - y, source % width - x
@@ -141,7 +121,7 @@ def describe(choices: Choices, batch: Batch) -> Tensor:
 
 
 #: Channels of a description.
-DESCRIPTION = 8 * CHOICES + 2 * 2 + 2 + 4 * (CHOICES - 1) + 2 + 2
+DESCRIPTION = 8 * CHOICES + 2 + 2 + 4 * (CHOICES - 1) + 2 + 2
 
 
 def _gradients(image: Tensor) -> tuple[Tensor, Tensor]:

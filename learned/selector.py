@@ -20,7 +20,6 @@ from learned.refiner import Update
 
 # What counts as right: KITTI's limits.
 _RIGHT_PX, _RIGHT_SHARE = 3.0, 0.05
-_MISTAKE_WEIGHT = 5  # of pixels whose state is wrong, in the loss: one in twenty is, and they would be learned last
 _NEVER = -1e4  # a logarithm of a probability; minus infinity has no derivative
 _FIRST_BIAS = 2.0  # for the state as it is, before training
 
@@ -33,11 +32,10 @@ class SelectorConfig:
     """(channels, dilation) of the hidden 3 x 3 convolutions."""
     least_jump_px: float = 1.0
     """Where nothing within reach differs by more in disparity, all stays as it is."""
-    sure: float = 0.83
-    """Probability from which another choice than the state is taken, at test time: it was trained to see five times as many
-    mistakes as there are, so this is where it is even."""
+    sure: float = 0.5
+    """Probability from which another choice than the state is taken, at test time."""
     steps: int = 2
-    """T: how often it chooses; each time values may come from 18 px farther away."""
+    """T: how often it chooses; each time values may come from 4 px farther away."""
 
     def __post_init__(self) -> None:
         if not self.layers or self.steps < 0 or not 0 <= self.sure <= 1:
@@ -137,9 +135,9 @@ def _outlier(error: Tensor, size: Tensor) -> Tensor:
 
 
 def selection_loss(logits: Tensor, choices: Choices, truth: Tensor, least_jump_px: float) -> Tensor:
-    """Weighted mean of ``-log p(right)`` over the pixels where some choices are right and others are not.
+    """Mean of ``-log p(right)`` over the pixels where some choices are right and others are not.
 
-    Pixels whose state is wrong weigh five times as much as others. A choice is right if all of it is; where none is, if its disparity is.
+    A choice is right if all of it is; where none is, if its disparity is.
 
     Parameters
     ----------
@@ -155,5 +153,4 @@ def selection_loss(logits: Tensor, choices: Choices, truth: Tensor, least_jump_p
     good = torch.where(whole.any(1, keepdim=True), whole, disparity)
     counts = (truth[:, 0] > 0) & good.any(1) & ~good.all(1) & (choices.jump > least_jump_px)
     probability = logits.log_softmax(1).masked_fill(~good, _NEVER).logsumexp(1)
-    weight = torch.where(good[:, 0], 1.0, _MISTAKE_WEIGHT) * counts
-    return -(weight * probability).sum() / weight.sum().clamp(min=1)
+    return -torch.where(counts, probability, 0).sum() / counts.sum().clamp(min=1)

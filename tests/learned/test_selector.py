@@ -46,15 +46,10 @@ def test_choices_are_whole_states_of_the_farthest_and_nearest_pixels(state):
         around = state[b, 0, rows, columns]
         assert choices.states[b, 1, 0, y, x] == around.min()
         assert choices.states[b, 2, 0, y, x] == around.max()
-        rows, columns = slice(max(y - 18, 0), y + 19), slice(max(x - 18, 0), x + 19)
-        assert around.max() <= choices.states[b, 4, 0, y, x] <= state[b, 0, rows, columns].max()
-        assert around.min() >= choices.states[b, 3, 0, y, x] >= state[b, 0, rows, columns].min()
         for k in range(1, CHOICES):
             there = flat[b, :, choices.sources[b, k - 1, y, x]]
             expected = torch.stack([there[0], state[b, 1, y, x], *there[2:]])
             torch.testing.assert_close(choices.states[b, k, :, y, x], expected, rtol=0, atol=0)
-    inside = choices.states[0, 4, 0, 14, 8:34]  # the box is within 18 px of all of these
-    assert (inside > 11).all()
     assert (choices.jump >= 0).all()
 
 
@@ -122,7 +117,7 @@ def test_untrained_it_changes_nothing_and_needs_evidence(batch):
 def test_what_it_is_sure_of_is_taken_where_there_is_a_jump(batch):
     selector = Selector(SMALL)
     with torch.no_grad():
-        selector.logits.bias.copy_(torch.tensor([0.0, 0, 5, 0, 0]))
+        selector.logits.bias.copy_(torch.tensor([0.0, 0, 4]))
     changed = batch.start + selector(View(batch.start), batch).change
     choices = find_choices(batch.start)
     jumps = (choices.jump > 1)[:, None].expand_as(changed)
@@ -154,8 +149,7 @@ def test_loss_is_the_probability_of_what_is_right(state):
     loss = selection_loss(logits, choices, truth, 1.0)
     whole, _ = right(choices.states, truth)
     counts = whole.any(1) & ~whole.all(1) & (choices.jump > 1) & torch.isfinite(truth[:, 0])
-    weight = torch.where(whole[:, 0], 1.0, 5.0)[counts]
-    expected = -((whole.sum(1)[counts] / CHOICES).log() * weight).sum() / weight.sum()
+    expected = -(whole.sum(1)[counts] / CHOICES).log().mean()
     torch.testing.assert_close(loss, expected)
     loss.backward()
     assert torch.isfinite(logits.grad).all()
