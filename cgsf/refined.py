@@ -26,11 +26,11 @@ if TYPE_CHECKING:
     from learned.selector import Selector
 
 
-#: The refiner that ships for each start; OpenCV's states are nearest to the solver's.
+#: The refiner that ships for each start.
 SHIPPED_REFINERS = {
     "feedforward": "refiner-feedforward",
-    "variational": "refiner-variational",
-    "opencv": "refiner-variational",
+    "variational": "selector-variational",
+    "opencv": "selector-variational",
 }
 
 

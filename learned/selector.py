@@ -32,7 +32,7 @@ class SelectorConfig:
     """(channels, dilation) of the hidden 3 x 3 convolutions."""
     least_jump_px: float = 1.0
     """Where nothing within reach differs by more in disparity, all stays as it is."""
-    sure: float = 0.5
+    sure: float = 0.7
     """Probability from which another choice than the state is taken, at test time."""
     steps: int = 2
     """T: how often it chooses; each time values may come from 4 px farther away."""

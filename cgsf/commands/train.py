@@ -18,7 +18,7 @@ def command(
     recipe: str, output: str, cache: str | None, starts: str | None, steps: int | None, minutes: float | None,
     threads: int | None, export: str | None,
 ) -> None:  # fmt: skip
-    """Train by a RECIPE: a .toml file, or the name of one that shipped weights were made with (as refiner-variational).
+    """Train by a RECIPE: a .toml file, or the name of one that shipped weights were made with (as selector-variational).
 
     Several processes share the work under torchrun: torchrun --nproc-per-node 2 -m cgsf.cli train RECIPE ...
     """

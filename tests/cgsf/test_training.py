@@ -21,6 +21,7 @@ from cgsf.feedforward import FeedforwardConfig
 from cgsf.recipe import Recipe, read_recipe, with_changes
 from cgsf.refined import RefinedConfig, load_refiner, run_refined
 from cgsf.sample_cache import SampleCache, write_cache
+from cgsf.feedforward import load_network
 from cgsf.stages import STAGES
 from cgsf.start_cache import StartCache, write_starts
 from cgsf.starts import StartConfig, load_start_config
@@ -332,10 +333,11 @@ def test_bad_input_is_one_clear_line(folder, tmp_path):
 
 
 def test_shipped_recipes_fit_the_shipped_networks():
-    names = ("flow", "disparity", "joint", "refiner-variational", "refiner-feedforward")
-    assert [read_recipe(name).stage for name in names] == ["flow", "disparity", "joint", "refiner", "refiner"]
+    names = ("flow", "disparity", "selector-variational", "joint", "refiner-feedforward")
+    assert [read_recipe(name).stage for name in names] == ["flow", "disparity", "selector", "joint", "refiner"]
+    assert read_recipe("selector-variational").selector == load_network("selector-variational").config
     assert read_recipe("self-supervised").supervision == "energy"
-    for name in (*names[2:], "self-supervised"):
+    for name in (*names[3:], "self-supervised"):
         refiner = read_recipe(name).refiner
         assert dataclasses.replace(refiner, steps=COMPACT.steps, inputs=COMPACT.inputs, evidence=0) == COMPACT
         assert set(COMPACT.inputs) <= set(refiner.inputs)
