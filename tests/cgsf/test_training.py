@@ -17,11 +17,10 @@ from cgsf.config import to_table
 from cgsf.datasets.frames import FrameFolders
 from cgsf.datasets.sample import Sample, Truth
 from cgsf.errors import InputError
-from cgsf.feedforward import FeedforwardConfig
+from cgsf.feedforward import FeedforwardConfig, load_network
 from cgsf.recipe import Recipe, read_recipe, with_changes
 from cgsf.refined import RefinedConfig, load_refiner, run_refined
 from cgsf.sample_cache import SampleCache, write_cache
-from cgsf.feedforward import load_network
 from cgsf.stages import STAGES
 from cgsf.start_cache import StartCache, write_starts
 from cgsf.starts import StartConfig, load_start_config
