@@ -100,11 +100,11 @@ def describe(choices: Choices, batch: Batch) -> Tensor:
     parts = []
     for choice in choices.states.unbind(1):
         d1, _, change, u, v = choice.unbind(1)
-        for there, at_x, at_y in ((1, x - d1, y + 0 * v), (2, x + u, y + v), (3, x + u - d1 - change, y + v)):
+        for there, at_x, at_y in ((1, x - d1, y), (2, x + u, y + v), (3, x + u - d1 - change, y + v)):
             difference = (_sample(seen[there], at_x, at_y) - seen[0]).abs()
             parts += [_COLOUR * difference[:, :3].mean(1, keepdim=True).clamp(max=0.5),
                       difference[:, 3:].sum(1, keepdim=True).clamp(max=1)]  # fmt: skip
-        hides = _sample(front[:, None], x - d1, y + 0 * v) - d1[:, None]
+        hides = _sample(front[:, None], x - d1, y) - d1[:, None]
         parts += [torch.asinh(hides / 2) / 2, (x - d1 < 0).to(state.dtype)[:, None]]
     farthest, nearest = (choices.states[:, k, :1] for k in (1, 2))
     jump = choices.jump[:, None]
@@ -131,9 +131,10 @@ def _gradients(image: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _sample(maps: Tensor, x: Tensor, y: Tensor) -> Tensor:
-    """(B, n, H, W) maps at (B, H, W) places, bilinearly; the border's values repeat outside."""
+    """(B, n, H, W) maps at places that broadcast to (B, H, W), bilinearly; the border's values repeat outside."""
     height, width = maps.shape[-2:]
-    places = torch.stack([x * (2 / max(width - 1, 1)) - 1, y * (2 / max(height - 1, 1)) - 1], -1)
+    x, y = torch.broadcast_tensors(x * (2 / max(width - 1, 1)) - 1, y * (2 / max(height - 1, 1)) - 1)
+    places = torch.stack([x, y], -1)
     return F.grid_sample(maps, places, mode="bilinear", padding_mode="border", align_corners=True)
 
 
