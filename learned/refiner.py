@@ -104,6 +104,18 @@ class Update(NamedTuple):
     """(B, 2, h, w): logits of the state's disparity and motion being right, at each block; with neighbours only."""
 
 
+def hidden_layers(channels: int, layers: tuple[tuple[int, int], ...]) -> nn.Sequential:
+    """3 x 3 convolutions of (channels, dilation), each with a rectifier."""
+    modules: list[nn.Module] = []
+    for width, dilation in layers:
+        convolution = nn.Conv2d(channels, width, 3, padding=dilation, dilation=dilation)
+        nn.init.kaiming_normal_(convolution.weight, nonlinearity="relu")
+        nn.init.zeros_(convolution.bias)  # type: ignore[arg-type]
+        modules += [convolution, nn.ReLU(inplace=True)]
+        channels = width
+    return nn.Sequential(*modules)
+
+
 class Refiner(nn.Module):
     """G. Its last layers start at zero: untrained, it changes nothing."""
 
@@ -111,16 +123,9 @@ class Refiner(nn.Module):
         super().__init__()
         self.config = config = config or RefinerConfig()
         self.grid = Grid(config.divisor)
-        channels, layers = config.channels, []
-        for width, dilation in config.layers:
-            layers += [nn.Conv2d(channels, width, 3, padding=dilation, dilation=dilation), nn.ReLU(inplace=True)]
-            channels = width
-        self.hidden = nn.Sequential(*layers)
+        channels = config.layers[-1][0]
+        self.hidden = hidden_layers(config.channels, config.layers)
         self.correction = nn.Conv2d(channels, 5, 3, padding=1)
-        for module in self.hidden:
-            if isinstance(module, nn.Conv2d):
-                nn.init.kaiming_normal_(module.weight, nonlinearity="relu")
-                nn.init.zeros_(module.bias)  # type: ignore[arg-type]
         heads: list[nn.Conv2d] = [self.correction]
         if config.neighbours:
             self.neighbours = Neighbours(config.neighbours)

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from learned.batch import Batch
 from learned.choices import CHOICES, DESCRIPTION, Choices, describe, find_choices
 from learned.inputs import View
-from learned.refiner import Update
+from learned.refiner import Update, hidden_layers
 
 # What counts as right: KITTI's limits.
 _RIGHT_PX, _RIGHT_SHARE = 3.0, 0.05
@@ -63,16 +63,8 @@ class Selector(nn.Module):
     def __init__(self, config: SelectorConfig | None = None) -> None:
         super().__init__()
         self.config = config = config or SelectorConfig()
-        channels, layers = DESCRIPTION, []
-        for width, dilation in config.layers:
-            layers += [nn.Conv2d(channels, width, 3, padding=dilation, dilation=dilation), nn.ReLU(inplace=True)]
-            channels = width
-        self.hidden = nn.Sequential(*layers)
-        for module in self.hidden:
-            if isinstance(module, nn.Conv2d):
-                nn.init.kaiming_normal_(module.weight, nonlinearity="relu")
-                nn.init.zeros_(module.bias)  # type: ignore[arg-type]
-        self.logits = nn.Conv2d(channels, CHOICES, 1)
+        self.hidden = hidden_layers(DESCRIPTION, config.layers)
+        self.logits = nn.Conv2d(config.layers[-1][0], CHOICES, 1)
         nn.init.zeros_(self.logits.weight)
         nn.init.zeros_(self.logits.bias)  # type: ignore[arg-type]
         with torch.no_grad():
