@@ -9,14 +9,14 @@ PATHS = [(1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, -1), (-1, 1), (1, -1)]
 """Steps (dx, dy) of the eight paths."""
 
 
-def census_distance(a: np.ndarray, b: np.ndarray, ax: int, bx: int, y: int, spacing: int) -> int:
-    """Neighbours of a 9 x 7 window, `spacing` apart, that are darker than the centre in one image only."""
+def census_distance(a: np.ndarray, b: np.ndarray, ax: int, bx: int, y: int, spacing: int, overlook: float = 0.0) -> int:
+    """Neighbours of a 9 x 7 window, `spacing` apart, that are darker than the centre, by more than so much, in one image only."""
     height, width = a.shape
     bits = 0
     for dy, dx in itertools.product(range(-3, 4), range(-4, 5)):
         at_y = min(max(y + dy * spacing, 0), height - 1)
-        in_a = a[at_y, min(max(ax + dx * spacing, 0), width - 1)] < a[y, ax]
-        in_b = b[at_y, min(max(bx + dx * spacing, 0), width - 1)] < b[y, bx]
+        in_a = a[at_y, min(max(ax + dx * spacing, 0), width - 1)] < a[y, ax] - overlook
+        in_b = b[at_y, min(max(bx + dx * spacing, 0), width - 1)] < b[y, bx] - overlook
         bits += bool(in_a != in_b)
     return bits
 

@@ -21,6 +21,10 @@ OUTSIDE_COST = 36
 """Cost of a match outside of the right image: more than a good match (about 20), less than a random one (60), so that
 surfaces continue across the left border instead of jumping to a wrong match inside."""
 
+_SMOOTHING_PX = 1.0
+_SMOOTHED_NOISE = 1 / (2 * np.sqrt(np.pi) * _SMOOTHING_PX)
+"""What smoothing leaves of white noise's deviation."""
+
 
 @intrinsic
 def popcount(typing_context, word):  # type: ignore[no-untyped-def]
@@ -42,15 +46,15 @@ def _join_halves(high: np.ndarray, low: np.ndarray, low_bits: int, words: np.nda
 
 
 @rowwise
-def _census(first: int, last: int, padded: np.ndarray, spacing: int, words: np.ndarray) -> None:
+def _census(first: int, last: int, centres: np.ndarray, padded: np.ndarray, spacing: int, words: np.ndarray) -> None:
     """One neighbour after the other over a whole row: halves of words are as wide as the image's numbers, so that a
     comparison and a shift are one vector instruction each."""
-    width, left = words.shape[1], CENSUS_COLUMNS * spacing
+    width = words.shape[1]
     columns = 2 * CENSUS_COLUMNS + 1
     neighbours = columns * (2 * CENSUS_ROWS + 1)
     halves = np.empty((2, width), np.uint32)
     for y in range(first, last):
-        centre = padded[y + CENSUS_ROWS * spacing, left : left + width]
+        centre = centres[y]
         halves[:] = 0
         for n in range(neighbours):
             begin = n % columns * spacing
@@ -58,13 +62,15 @@ def _census(first: int, last: int, padded: np.ndarray, spacing: int, words: np.n
         _join_halves(halves[0], halves[1], neighbours - 32, words[y])
 
 
-def census(grey: np.ndarray) -> np.ndarray:
+def census(grey: np.ndarray, overlook: float = 0.0) -> np.ndarray:
     """Census words of a grey image: fine, and twice as wide on the smoothed image.
 
     Parameters
     ----------
     grey : np.ndarray
         (H, W) float32. Positions outside take the nearest pixel.
+    overlook : float
+        A neighbour that is darker by no more than this is not told from the centre.
 
     Returns
     -------
@@ -72,10 +78,11 @@ def census(grey: np.ndarray) -> np.ndarray:
         (2, H, W) uint64; one bit a neighbour, set where it is darker than the centre.
     """
     words = np.empty((2, *grey.shape), np.uint64)
-    for k, image in enumerate((grey, cv2.GaussianBlur(grey, (0, 0), 1.0))):
+    smooth = cv2.GaussianBlur(grey, (0, 0), _SMOOTHING_PX)
+    for k, (image, least) in enumerate(((grey, overlook), (smooth, overlook * _SMOOTHED_NOISE))):
         rows, columns = (k + 1) * CENSUS_ROWS, (k + 1) * CENSUS_COLUMNS
         padded = cv2.copyMakeBorder(image, rows, rows, columns, columns, cv2.BORDER_REPLICATE)
-        over_rows(_census, len(grey), padded, k + 1, words[k])
+        over_rows(_census, len(grey), image - np.float32(least), padded, k + 1, words[k])
     return words
 
 

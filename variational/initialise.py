@@ -60,9 +60,12 @@ def dense_inverse_search(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     return search.calc(to_bytes(first), to_bytes(second), None)
 
 
-def opencv_match(left: np.ndarray, right: np.ndarray, searched: int) -> StereoMatch:
-    """OpenCV's semi-global matching, as people use it: block of 5, left-right check, background filling."""
-    padded = 16 * int(np.ceil((searched + 1) / 16))
+def opencv_match(left: np.ndarray, right: np.ndarray, config: MatchingConfig) -> StereoMatch:
+    """OpenCV's semi-global matching, as people use it: block of 5, left-right check, background filling.
+
+    Of the settings it takes the range alone; the census words are for whoever compares them later.
+    """
+    padded = 16 * int(np.ceil((config.max_disparity + 1) / 16))
     matcher = cv2.StereoSGBM.create(
         0, padded, 5, P1=24 * 25, P2=96 * 25, disp12MaxDiff=1, uniquenessRatio=5, speckleWindowSize=100, speckleRange=2,
         mode=cv2.StereoSGBM_MODE_SGBM_3WAY,
@@ -70,7 +73,8 @@ def opencv_match(left: np.ndarray, right: np.ndarray, searched: int) -> StereoMa
     views = [cv2.copyMakeBorder(to_bytes(view), 0, 0, padded, 0, cv2.BORDER_CONSTANT) for view in (left, right)]
     disparity = matcher.compute(*views)[:, padded:].astype(np.float32) / 16
     matched = disparity > 0
-    return StereoMatch(fill_background(disparity, matched), matched, census(left), census(right), searched)
+    words_left, words_right = census(left, config.overlook), census(right, config.overlook)
+    return StereoMatch(fill_background(disparity, matched), matched, words_left, words_right, config.max_disparity)
 
 
 def initialise(frames: Frames, name: StartName, config: MatchingConfig) -> Start:
@@ -91,14 +95,12 @@ def initialise(frames: Frames, name: StartName, config: MatchingConfig) -> Start
     left1, right1, left2, right2 = frames.grey
     shape = left1.shape
     if name == "zero":
-        nothing = [
-            StereoMatch(np.zeros(shape, np.float32), np.zeros(shape, bool), census(left), census(right), 0)
-            for left, right in ((left1, right1), (left2, right2))
-        ]
+        unknown, nowhere = np.zeros(shape, np.float32), np.zeros(shape, bool)
+        words = [census(view, config.overlook) for view in frames.grey]
+        nothing = [StereoMatch(unknown, nowhere, words[k], words[k + 1], 0) for k in (0, 2)]
         return Start(np.zeros((5, *shape), np.float32), np.zeros((*shape, 2), np.float32), *nothing)
     searched = config.max_disparity or find_max_disparity(left1, right1, config)
-    matching = partial(match, config=replace(config, max_disparity=searched))
-    pair = matching if name == "matching" else partial(opencv_match, searched=searched)
+    pair = partial(match if name == "matching" else opencv_match, config=replace(config, max_disparity=searched))
     match1, match2, flow, backward = side_by_side(
         partial(pair, left1, right1), partial(pair, left2, right2),
         partial(dense_inverse_search, left1, left2), partial(dense_inverse_search, left2, left1),

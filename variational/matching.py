@@ -48,6 +48,9 @@ class MatchingConfig:
         those of the average disparity: what has no texture of its own only takes over what its neighbours have.
     speckle_px : int
         Matched regions of fewer pixels than this are unmatched.
+    overlook : float
+        Differences of intensity up to this, in [0, 1], tell the matching nothing. The solver raises it to the amplitude of
+        a pattern that all images share (variational.shared_pattern).
     """
 
     max_disparity: int = 0
@@ -58,6 +61,7 @@ class MatchingConfig:
     uniqueness: float = 40.0
     evidence: float = 3.0
     speckle_px: int = 60
+    overlook: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -380,7 +384,7 @@ def match(left: np.ndarray, right: np.ndarray, config: MatchingConfig) -> Stereo
         Disparity of the left image.
     """
     searched = config.max_disparity or find_max_disparity(left, right, config)
-    words_left, words_right = census(left), census(right)
+    words_left, words_right = census(left, config.overlook), census(right, config.overlook)
     costs = stereo_costs(words_left, words_right, max(2, min(searched + 1, left.shape[1])))
     disparity, matched = aggregate(costs, left, config)
     matched &= has_evidence(costs, disparity, config.evidence)

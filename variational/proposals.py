@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 
 from variational.camera import StereoCamera
+from variational.census import census
 from variational.edges import EdgesConfig, other_sides
 from variational.evidence import EvidenceConfig, refill
 from variational.frames import Frames
@@ -175,7 +176,7 @@ def propose(
     (known, motions), match1 = side_by_side(search, fill_planes)
     if not motions:
         return keep(start)
-    words = (start.match1.words_left, start.match2.words_left, start.match2.words_right)
+    words = _motion_words(start, frames, matching)
     state = start.state.copy()
     state[D1] = match1.disparity
 
@@ -212,6 +213,17 @@ def propose(
     motions += found
     labels, cost = fuse(2)
     return Proposal(state, labels, motions, cost, known)
+
+
+def _motion_words(start: Start, frames: Frames, config: MatchingConfig) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Census words of left1, left2 and right2 in which nothing is overlooked.
+
+    A pattern that stands still speaks for standing still alone, which few pixels do; faint textures speak for the right motion.
+    """
+    if config.overlook == 0:
+        return start.match1.words_left, start.match2.words_left, start.match2.words_right
+    left1, _, left2, right2 = frames.grey
+    return census(left1), census(left2), census(right2)
 
 
 def _with_planes(match: StereoMatch, image: np.ndarray, config: PlanesConfig) -> StereoMatch:

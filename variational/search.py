@@ -41,7 +41,7 @@ def match_around(
     StereoMatch
     """
     searched = int(min(np.ceil(prior.max() + radius_px), left.shape[1] - 1))
-    words_left, words_right = census(left), census(right)
+    words_left, words_right = census(left, config.overlook), census(right, config.overlook)
     costs = stereo_costs(words_left, words_right, max(2, searched + 1))
     over_rows(_forbid_outside, len(costs), costs, prior, np.float32(radius_px))
     disparity, matched = aggregate(costs, left, config)

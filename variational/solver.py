@@ -25,6 +25,7 @@ from variational.planes import PlanesConfig
 from variational.proposals import MEASURED, keep, propose
 from variational.pyramid import resize_image
 from variational.rigid import RigidConfig
+from variational.shared_pattern import pattern_amplitude
 from variational.state import D1, enlarge_state, flow_of
 from variational.terms.constancy import ConstancyConfig
 from variational.visibility import backward_flow, project_visibility
@@ -148,7 +149,11 @@ def solve(
     if 0 < config.most_pixels < height * width:
         size = max(np.sqrt(config.most_pixels / (height * width)), MIN_SIDE / min(height, width))
         shape = (round(height * size), round(width * size))
-        return _solve_smaller(frames, replace(config, most_pixels=0), camera, progress, shape)
+        # averaging over pixels weakens a pattern as it does noise, and may hide it
+        overlook = max(config.matching.overlook, size * pattern_amplitude(frames.grey))
+        smaller = replace(config, most_pixels=0, matching=replace(config.matching, overlook=overlook))
+        return _solve_smaller(frames, smaller, camera, progress, shape)
+    matching = replace(config.matching, overlook=max(config.matching.overlook, pattern_amplitude(frames.grey)))
     seconds: dict[str, float] = {}
 
     @contextmanager
@@ -162,16 +167,16 @@ def solve(
     history: History = []
     reason = "all stages done"
     with stage("start", 0.0):
-        start = initialise(frames, config.start, config.matching)
+        start = initialise(frames, config.start, matching)
     initial = start.state
     if config.start == "zero":
         with stage("from zero", 0.1):
-            start, history = from_zero(frames, config.from_zero, config.constancy, config.matching)
+            start, history = from_zero(frames, config.from_zero, config.constancy, matching)
     proposal = keep(start)
     if config.proposals:
         with stage("proposals", 0.5):
             proposal = propose(
-                start, frames, camera, config.matching, config.rigid, config.objects, config.planes,
+                start, frames, camera, matching, config.rigid, config.objects, config.planes,
                 config.fusion, config.evidence, config.edges,
             )  # fmt: skip
     with stage("refine", 0.8):

@@ -24,13 +24,15 @@ def pair(disparity: int, shape: tuple[int, int] = (48, 90)) -> tuple[np.ndarray,
     return np.ascontiguousarray(wide[:, : shape[1]]), np.ascontiguousarray(wide[:, disparity:])
 
 
-def test_costs_are_differing_census_bits() -> None:
+@pytest.mark.parametrize("overlook", [0.0, 0.125])
+def test_costs_are_differing_census_bits(overlook: float) -> None:
     left, right = texture(SHAPE, 1), texture(SHAPE, 2)
-    costs = stereo_costs(census(left), census(right), 6)
+    costs = stereo_costs(census(left, overlook), census(right, overlook), 6)
     smooth = [cv2.GaussianBlur(image, (0, 0), 1.0) for image in (left, right)]
     for y, x, d in [(0, 0, 0), (0, 3, 2), (5, 9, 4), (10, 16, 5), (7, 5, 5)]:
-        expected = naive_matching.census_distance(left, right, x, x - d, y, 1)
-        expected += naive_matching.census_distance(*smooth, x, x - d, y, 2)
+        expected = naive_matching.census_distance(left, right, x, x - d, y, 1, np.float32(overlook))
+        smoothed = np.float32(overlook / np.sqrt(4 * np.pi))  # a Gaussian of one pixel leaves so much of white noise
+        expected += naive_matching.census_distance(*smooth, x, x - d, y, 2, smoothed)
         assert costs[y, x, d] == expected
     assert (costs[:, 2, 3:] == OUTSIDE_COST).all()
 
