@@ -44,7 +44,7 @@ def aggregate(costs: np.ndarray, large: Callable[[int, int, int, int], int], sma
 
 
 def select(total: np.ndarray, tolerance: float, uniqueness: float) -> tuple[np.ndarray, np.ndarray]:
-    """Disparity with a parabola fit, and whether it is unique and the right view agrees."""
+    """Disparity with a parabola fit, and whether it is not the range's end, is unique, and the right view agrees."""
     height, width, disparities = total.shape
     disparity, matched = np.zeros((height, width)), np.zeros((height, width), bool)
     for y, x in np.ndindex(height, width):
@@ -55,7 +55,7 @@ def select(total: np.ndarray, tolerance: float, uniqueness: float) -> tuple[np.n
             disparity[y, x] += (row[at - 1] - row[at + 1]) / (2 * (row[at - 1] + row[at + 1] - 2 * row[at]))
         others = [row[d] for d in range(disparities) if abs(d - at) > 1]
         right = round(x - disparity[y, x])
-        if right >= 0 and (not others or min(others) - row[at] >= uniqueness):
+        if right >= 0 and at < disparities - 1 and (not others or min(others) - row[at] >= uniqueness):
             second = min((total[y, right + d, d], d) for d in range(disparities) if right + d < width)[1]
             matched[y, x] = abs(second - disparity[y, x]) <= tolerance
     return disparity, matched

@@ -174,6 +174,8 @@ def _select_row(
 ) -> None:  # fmt: skip
     """Smallest total of each pixel of a row, with a parabola fit, and whether it is unique and the right view agrees.
 
+    The range's end is no match: whether the next disparity would cost less was not asked, and a white sky goes there.
+
     right_best, right_at (W + D): room for the right view, from its right end: the smallest total on the diagonal of
     each of its pixels, and its disparity. Overwrites totals (W, D).
     """
@@ -202,7 +204,7 @@ def _select_row(
         runner_up = np.int16(32767)
         for d in range(disparities):
             runner_up = _min16(runner_up, row[d])
-        matched[x] = np.float32(runner_up) - np.float32(best) >= uniqueness
+        matched[x] = at < disparities - 1 and np.float32(runner_up) - np.float32(best) >= uniqueness
     for x in range(width):
         at = int(np.rint(x - disparity[x]))
         agrees = at >= 0 and abs(right_at[width - 1 - at] - disparity[x]) <= tolerance

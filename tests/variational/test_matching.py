@@ -145,3 +145,10 @@ def test_what_has_no_texture_is_unmatched_though_its_outline_tells_a_disparity()
     assert found.matched[inside].mean() < 0.1
     assert found.matched[textured].mean() > 0.95
     np.testing.assert_array_equal(found.disparity[textured], kept.disparity[textured])
+
+
+def test_the_end_of_the_range_is_no_match() -> None:
+    left, right = pair(12)
+    beyond, inside = (match(left, right, MatchingConfig(max_disparity=most)).matched[:, 24:] for most in (12, 13))
+    assert not beyond.any()
+    assert inside.mean() > 0.9
