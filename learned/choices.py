@@ -10,20 +10,27 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from learned.alternatives import kernels_may
 from learned.batch import Batch
+from learned.choice_kernels import describe_rows, extremes_along, extremes_down, votes_of_rows
+from learned.threads import over_tasks
 
 #: The state itself, the farthest and the nearest thing close by.
 CHOICES = 3
 
 _CLOSE_PX = 4
-_VOTERS_PX = range(-9, 10, 3)
+_VOTERS_REACH_PX = 9
 _VOTERS_MOST_PX = 9.3
 _VOTERS_COLOUR = 0.1  # mean difference of the channels from which a pixel has no vote
 _VOTERS_DISTANCE_PX = 6.0  # where a vote weighs 1 / e
+_STEPS_PX = range(-_VOTERS_REACH_PX, _VOTERS_REACH_PX + 1, 3)
+_VOTERS = [(dy, dx) for dy in _STEPS_PX for dx in _STEPS_PX if math.hypot(dy, dx) <= _VOTERS_MOST_PX]
+_VOTERS_WEIGHTS = [math.exp(-math.hypot(dy, dx) / _VOTERS_DISTANCE_PX) for dy, dx in _VOTERS]
 _GRADIENT, _COLOUR = 4.0, 4.0  # factors that bring differences into a range of about one
 _LEAST_JUMP_PX = 0.5
 
@@ -43,13 +50,29 @@ class Choices(NamedTuple):
 
 
 def find_choices(state: Tensor) -> Choices:
-    """The choices of a state (B, 5, H, W)."""
-    sources = [_largest_close_by(sign * state[:, :1]) for sign in (-1, 1)]
+    """The choices of a state (B, 5, H, W). Without a graph to build, on a CPU, kernels look for them."""
+    sources = _sources_by_kernels(state) if kernels_may(state) else _sources(state)
     states = [state]
-    for source in sources:
+    for source in sources.split(1, 1):
         there = _take(state, source)
         states.append(torch.cat([there[:, :1], state[:, 1:2], there[:, 2:]], 1))
-    return Choices(torch.stack(states, 1), torch.cat(sources, 1))
+    return Choices(torch.stack(states, 1), sources)
+
+
+def _sources(state: Tensor) -> Tensor:
+    """(B, 2, H, W) int64: where the farthest and the nearest thing close by are, as indices into the flat image."""
+    return torch.cat([_largest_close_by(sign * state[:, :1]) for sign in (-1, 1)], 1)
+
+
+def _sources_by_kernels(state: Tensor) -> Tensor:
+    """As `_sources`."""
+    disparity = state[:, 0].contiguous().numpy()
+    best, at = np.empty((2, *disparity.shape), np.float32), np.empty((2, *disparity.shape), np.int64)
+    sources = torch.empty((len(disparity), 2, *disparity.shape[1:]), dtype=torch.int64)
+    rows = disparity.shape[0] * disparity.shape[1]
+    over_tasks(extremes_along, rows, disparity, _CLOSE_PX, best, at)
+    over_tasks(extremes_down, rows, best, at, _CLOSE_PX, sources.numpy())
+    return sources
 
 
 def _largest_close_by(values: Tensor) -> Tensor:
@@ -82,6 +105,8 @@ def _take(maps: Tensor, sources: Tensor) -> Tensor:
 def describe(choices: Choices, batch: Batch) -> Tensor:
     """What speaks for each choice (B, DESCRIPTION, H, W), float32, in a range of about one.
 
+    Without a graph to build, on a CPU, kernels do it in one pass.
+
     Parameters
     ----------
     choices : Choices
@@ -90,6 +115,8 @@ def describe(choices: Choices, batch: Batch) -> Tensor:
     """
     if batch.evidence is None or batch.evidence.shape[1] != 2:
         raise ValueError("choosing needs the start's confidence and visibility")
+    if kernels_may(choices.states) and kernels_may(batch.images):
+        return _describe_by_kernels(choices, batch.images, batch.evidence)
     left1, evidence = batch.images[:, 0], batch.evidence
     state = choices.states[:, 0]
     height, width = state.shape[-2:]
@@ -118,6 +145,21 @@ def describe(choices: Choices, batch: Batch) -> Tensor:
     parts += [_GRADIENT * each for each in _gradients(left1)]
     parts.append(2 * _votes(left1, state[:, :1], evidence[:, :1], (farthest + nearest) / 2) - 1)
     return torch.cat(parts, 1)
+
+
+def _describe_by_kernels(choices: Choices, images: Tensor, evidence: Tensor) -> Tensor:
+    """As `describe`, with channels innermost in memory."""
+    states = choices.states.contiguous()
+    count, _, _, height, width = states.shape
+    steps = [_GRADIENT * each for each in _gradients(images.flatten(0, 1))]
+    seen = torch.cat([images.flatten(0, 1), *steps], 1).unflatten(0, images.shape[:2]).flatten(3)
+    middle = (states[:, 1, 0] + states[:, 2, 0]) / 2
+    votes = _votes_by_kernels(images[:, 0], states[:, 0, :1], evidence[:, :1], middle)
+    out = torch.empty((count, height, width, DESCRIPTION))
+    maps = states, choices.sources.contiguous(), seen, _front(states[:, 0, 0]), evidence.contiguous(), votes
+    scales = (np.float32(each) for each in (_LEAST_JUMP_PX, _COLOUR, 1 / (2 * _CLOSE_PX)))
+    over_tasks(describe_rows, count * height, *(each.numpy() for each in maps), *scales, out.numpy())
+    return out.permute(0, 3, 1, 2)
 
 
 #: Channels of a description.
@@ -150,17 +192,23 @@ def _front(disparity: Tensor) -> Tensor:
 def _votes(image: Tensor, disparity: Tensor, confidence: Tensor, middle: Tensor) -> Tensor:
     """(B, 2, H, W): share of the pixels around, by colour and distance, that lie in front of the middle of a jump; and of
     the confident ones. See `variational.edges`."""
-    around = _Surroundings(torch.cat([image, disparity, confidence**2], 1), _VOTERS_PX[-1])
+    around = _Surroundings(torch.cat([image, disparity, confidence**2], 1), _VOTERS_REACH_PX)
     totals, fronts = torch.full_like(image[:, :2], 1e-6), torch.zeros_like(image[:, :2])
-    for dy in _VOTERS_PX:
-        for dx in _VOTERS_PX:
-            distance = math.hypot(dy, dx)
-            if distance > _VOTERS_MOST_PX:
-                continue
-            voter = around(dy, dx)
-            unlike = (voter[:, :3] - image).abs().mean(1, keepdim=True)
-            vote = (1 - unlike / _VOTERS_COLOUR).clamp(min=0) ** 2 * math.exp(-distance / _VOTERS_DISTANCE_PX)
-            votes = torch.cat([vote, vote * voter[:, 4:]], 1)
-            totals += votes
-            fronts += votes * (voter[:, 3:4] > middle)
+    for (dy, dx), weight in zip(_VOTERS, _VOTERS_WEIGHTS, strict=True):
+        voter = around(dy, dx)
+        unlike = (voter[:, :3] - image).abs().mean(1, keepdim=True)
+        vote = (1 - unlike / _VOTERS_COLOUR).clamp(min=0) ** 2 * weight
+        votes = torch.cat([vote, vote * voter[:, 4:]], 1)
+        totals += votes
+        fronts += votes * (voter[:, 3:4] > middle)
     return fronts / totals
+
+
+def _votes_by_kernels(image: Tensor, disparity: Tensor, confidence: Tensor, middle: Tensor) -> Tensor:
+    """As `_votes`, but for the middle, (B, H, W)."""
+    around = _Surroundings(torch.cat([image, disparity, confidence**2], 1), _VOTERS_REACH_PX)
+    out = torch.empty((len(image), 2, *image.shape[2:]))
+    voters = np.array(_VOTERS), np.array(_VOTERS_WEIGHTS, np.float32), _VOTERS_REACH_PX, np.float32(1 / _VOTERS_COLOUR)
+    rows = image.shape[0] * image.shape[2]
+    over_tasks(votes_of_rows, rows, around.padded.numpy(), middle.contiguous().numpy(), *voters, out.numpy())
+    return out

@@ -76,8 +76,8 @@ class Selector(nn.Module):
 
     def weigh(self, state: Tensor, batch: Batch) -> tuple[Tensor, Choices]:
         """Logits (B, CHOICES, H, W) and the choices that they are about."""
-        choices = find_choices(state)
         with torch.no_grad():
+            choices = find_choices(state)
             seen = describe(choices, batch)
         return self.logits(self.hidden(seen.contiguous(memory_format=torch.channels_last))).float(), choices
 

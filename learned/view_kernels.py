@@ -180,8 +180,8 @@ def _second_pair(own: np.ndarray, line: int, divisor: int, d2: np.ndarray, backw
     height, width = d2.shape
     for i in range(own.shape[1]):
         u, v = own[3, i], own[4, i]
-        x = _inside(np.float32(i * divisor + divisor - 1) + u, width)
-        y = _inside(np.float32(line) + v, height)
+        x = inside(np.float32(i * divisor + divisor - 1) + u, width)
+        y = inside(np.float32(line) + v, height)
         x0, y0 = np.uint64(x), np.uint64(y)
         x1, y1 = min(x0 + np.uint64(1), np.uint64(width - 1)), min(y0 + np.uint64(1), np.uint64(height - 1))
         fx, fy = x - np.float32(x0), y - np.float32(y0)
@@ -192,7 +192,7 @@ def _second_pair(own: np.ndarray, line: int, divisor: int, d2: np.ndarray, backw
 
 
 @lanes
-def _inside(position: np.float32, size: int) -> np.float32:
+def inside(position: np.float32, size: int) -> np.float32:
     """The nearest position on an axis of `size` pixels; the last one for NaN."""
     most = np.float32(size - 1)
     position = position if position < most else most

@@ -53,6 +53,38 @@ def test_choices_are_whole_states_of_the_farthest_and_nearest_pixels(state):
     assert (choices.jump >= 0).all()
 
 
+@pytest.mark.parametrize("spread", [0.0, 60.0])
+@pytest.mark.parametrize("threads", [1, 2])
+def test_kernels_say_what_torch_says(batch, spread, threads):
+    """Also of states that lead far outside of the images, of layers that are exactly even, and of any number of threads."""
+    state = torch.where(batch.start > 8, 12.0, 4.0) if spread == 0 else batch.start.clone()
+    state += spread * (torch.rand(state.shape, generator=torch.Generator().manual_seed(3)) - 0.5)
+    state[:, :2].clamp_(min=0)
+    kept = state.clone(), batch.images.clone()
+    plain = find_choices(state)
+    expected = describe(plain, batch)
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        with torch.inference_mode():
+            found = find_choices(state)
+            described = describe(found, batch)
+    finally:
+        torch.set_num_threads(before)
+    torch.testing.assert_close(found.sources, plain.sources, rtol=0, atol=0)
+    torch.testing.assert_close(found.states, plain.states, rtol=0, atol=0)
+    torch.testing.assert_close(described, expected, rtol=0, atol=2e-4)
+    torch.testing.assert_close((state, batch.images), kept, rtol=0, atol=0)
+
+
+def test_where_nothing_is_a_number_kernels_stay_inside_the_image(batch):
+    with torch.inference_mode():
+        choices = find_choices(torch.full_like(batch.start, torch.nan))
+        own = torch.arange(HEIGHT * WIDTH).view(HEIGHT, WIDTH)
+        torch.testing.assert_close(choices.sources, own.expand_as(choices.sources))
+        assert describe(choices, batch).shape == (2, DESCRIPTION, HEIGHT, WIDTH)
+
+
 def test_a_choice_that_the_images_confirm_looks_alike_everywhere():
     """left1 shifted by (D, F, D + C): the true state has no differences, a wrong one has."""
     noise = torch.rand((1, 3, HEIGHT, WIDTH + 60), generator=torch.Generator().manual_seed(2))
