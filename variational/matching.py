@@ -63,6 +63,10 @@ class MatchingConfig:
     speckle_px: int = 60
     overlook: float = 0.0
 
+    def __post_init__(self) -> None:
+        if not 0 <= self.overlook < 1:
+            raise ValueError(f"MatchingConfig.overlook must lie in 0 ... 1, got {self.overlook}")
+
 
 @dataclass(frozen=True, eq=False)
 class StereoMatch:

@@ -176,7 +176,7 @@ def propose(
     (known, motions), match1 = side_by_side(search, fill_planes)
     if not motions:
         return keep(start)
-    words = _motion_words(start, frames, matching)
+    words = motion_words(start, frames, matching)
     state = start.state.copy()
     state[D1] = match1.disparity
 
@@ -215,7 +215,7 @@ def propose(
     return Proposal(state, labels, motions, cost, known)
 
 
-def _motion_words(start: Start, frames: Frames, config: MatchingConfig) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def motion_words(start: Start, frames: Frames, config: MatchingConfig) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Census words of left1, left2 and right2 in which nothing is overlooked.
 
     A pattern that stands still speaks for standing still alone, which few pixels do; faint textures speak for the right motion.

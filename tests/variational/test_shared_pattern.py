@@ -6,7 +6,11 @@ import cv2
 import numpy as np
 import pytest
 
+from variational.census import census
 from variational.frames import Frames
+from variational.initialise import initialise
+from variational.matching import MatchingConfig
+from variational.proposals import motion_words
 from variational.shared_pattern import pattern_amplitude
 from variational.solver import SolverConfig, solve
 from variational.state import D1
@@ -74,3 +78,28 @@ def test_a_white_wall_is_not_matched_by_the_pattern(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr("variational.solver.pattern_amplitude", lambda grey: 0.0)
     misled = np.abs(solve(images, config).state[D1][WALL] - DISPARITY)
     assert (misled > 3).mean() > 0.4, "the scene no longer shows what the pattern does"
+
+
+@pytest.mark.parametrize("overlook", [0.0, 4 * DEVIATION])
+def test_motions_are_compared_with_nothing_overlooked(overlook: float) -> None:
+    images, config = frames(white_wall([pattern(0)] * 4)), MatchingConfig(overlook=overlook)
+    start = initialise(images, "matching", config)
+    for words, image in zip(motion_words(start, images, config), (images.grey[k] for k in (0, 2, 3)), strict=True):
+        np.testing.assert_array_equal(words, census(image))
+    assert (start.match1.words_left == census(images.grey[0], overlook)).all()
+
+
+def test_a_smaller_size_overlooks_what_averaging_leaves(monkeypatch: pytest.MonkeyPatch) -> None:
+    images = frames(white_wall([pattern(0)] * 4))
+    told = []
+    monkeypatch.setattr("variational.solver.initialise", lambda frames, name, config: told.append(config.overlook) or 1 / 0)
+    monkeypatch.setattr("variational.solver.pattern_amplitude", lambda grey: 0.02 if grey[0].shape == SHAPE else 0.0)
+    with pytest.raises(ZeroDivisionError):
+        solve(images, SolverConfig(most_pixels=SHAPE[0] * SHAPE[1] // 4))
+    assert told == [pytest.approx(0.01)]
+
+
+@pytest.mark.parametrize("overlook", [-0.1, 1.0, float("nan")])
+def test_differences_larger_than_the_range_are_refused(overlook: float) -> None:
+    with pytest.raises(ValueError, match=r"MatchingConfig.overlook must lie in 0 \.\.\. 1"):
+        MatchingConfig(overlook=overlook)
