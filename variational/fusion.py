@@ -46,7 +46,8 @@ class FusionConfig:
     disparity_edge_px, intensity_edge : float
         Jumps at which the price has fallen to a third.
     measured_prior, object_prior : float
-        Added to the cost of measured flow and of a moving object's motion: what is rigid and still needs no excuse.
+        Added to the cost of measured flow, and of a moving object's motion where it was not found: what is rigid and still,
+        or was seen to move so, needs no excuse.
     """
 
     truncation: float = 0.4

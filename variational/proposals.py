@@ -91,8 +91,9 @@ def correspondences(start: Start) -> Correspondences:
     return replace(trips, valid=trips.valid & start.match1.matched & matched2)
 
 
-def _nearby(motions: list[RigidMotion], slots: int) -> np.ndarray:
-    """(slots, H, W) int: the objects nearest to each pixel, nearest first, MEASURED where there are none near.
+def nearby(motions: list[RigidMotion], slots: int) -> tuple[np.ndarray, np.ndarray]:
+    """(slots, H, W) int: the objects nearest to each pixel, nearest first, MEASURED where there are none near; and bool,
+    where the pixel is one of those that the object's motion was found by.
 
     Near is within half of the object's own size: what moves with it but could not be matched lies around it.
     """
@@ -103,7 +104,18 @@ def _nearby(motions: list[RigidMotion], slots: int) -> np.ndarray:
         rows, columns = (_span(np.any(motion.support, axis), int(1.1 * reach)) for axis in (1, 0))  # chamfers run short
         distance = cv2.distanceTransform((~motion.support[rows, columns]).astype(np.uint8), cv2.DIST_L2, 3)
         over_rows(_insert, len(distance), distance, reach, index, nearest[:, rows, columns], labels[:, rows, columns])
-    return labels[: len(motions) - 1]
+    return labels[: len(motions) - 1], nearest[: len(motions) - 1] == 0
+
+
+def with_priors(costs: np.ndarray, found_there: np.ndarray, config: FusionConfig) -> np.ndarray:
+    """Costs (K, H, W) of the measured motion, the camera's and K - 2 objects', with what the choice of each must make up for.
+
+    An object's motion is free where it was found, (K - 2, H, W) bool: parts of it that show no texture follow the rest.
+    """
+    biased = costs.copy()
+    biased[0] += config.measured_prior
+    biased[2:] += np.where(found_there, np.float32(0), np.float32(config.object_prior))
+    return biased
 
 
 def _span(occupied: np.ndarray, margin: int) -> slice:
@@ -183,13 +195,12 @@ def propose(
     def fuse(objects_near: int) -> tuple[np.ndarray, np.ndarray]:
         """Labels and costs under the motions so far; writes the chosen motion to the state."""
         everywhere = np.array([MEASURED, 0])[:, None, None] + np.zeros_like(nothing)
-        labels_of = np.concatenate([everywhere, _nearby(motions, objects_near)])
+        objects_there, found_there = nearby(motions, objects_near)
+        labels_of = np.concatenate([everywhere, objects_there])
         candidates = _candidates(state, start, motions, labels_of)
         costs = motion_costs(candidates, state[D1], words, fusion)
-        biased = costs.copy()
-        biased[0] += fusion.measured_prior
-        biased[2:] += fusion.object_prior
-        chosen, labels, cost = choose(candidates, biased, state[D1], grey, fusion), np.empty_like(nothing), np.empty_like(grey)
+        chosen = choose(candidates, with_priors(costs, found_there, fusion), state[D1], grey, fusion)
+        labels, cost = np.empty_like(nothing), np.empty_like(grey)
         over_rows(_take, len(grey), chosen, candidates, labels_of, costs, state[C:], labels, cost)
         return labels, cost
 
