@@ -66,8 +66,12 @@ def test_a_clean_scene_and_a_scene_far_away_have_none() -> None:
 
 
 def test_too_little_that_is_flat_tells_nothing() -> None:
-    images = [texture(SHAPE, 1) + pattern(0) for _ in range(4)]
-    assert pattern_amplitude(frames(images).grey) == 0
+    scene = texture(SHAPE, 1)
+    assert pattern_amplitude(frames([scene + pattern(0)] * 4).grey) == 0
+    scene[:20, :20] = 0.5  # 324 pixels whose neighbours are flat, too
+    assert pattern_amplitude(frames([scene + pattern(0)] * 4).grey) == 0
+    scene[20:30, :20] = 0.5
+    assert pattern_amplitude(frames([scene + pattern(0)] * 4).grey) > 0
 
 
 @pytest.mark.parametrize("most_pixels", [0, SHAPE[0] * SHAPE[1] // 2])
