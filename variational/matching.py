@@ -33,7 +33,8 @@ class MatchingConfig:
     Parameters
     ----------
     max_disparity : int
-        Largest disparity searched, in pixels; 0 finds it by searching a third of the width at a quarter of the size.
+        Largest disparity searched, in pixels, which counts as no match itself; 0 finds it by searching a third of the width
+        at a quarter of the size.
     small_step, large_step : int
         Penalties for a change of disparity by one pixel and by more, in census bits; raising them smooths.
     edge_contrast : float
