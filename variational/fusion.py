@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from variational.census import BITS, popcount
-from variational.jit import inlined, over_bands, over_rows, rowwise, side_by_side
+from variational.jit import inlined, over_bands, over_rows, rowwise, scalar, side_by_side
 
 STRIP = 192
 """Columns that a chain works on at a time: their candidates and costs of two rows stay in the nearest cache, and what
@@ -62,6 +62,22 @@ class FusionConfig:
     object_prior: float = 0.1
 
 
+@scalar
+def _disagreement(
+    words_left1: np.ndarray, words_left2: np.ndarray, words_right2: np.ndarray, y: int, x: int, at_y: int, at_x: int,
+    right_x: int, largest: np.float32,
+) -> float:  # fmt: skip
+    """Share of `largest` by which the words of left1 at (y, x) differ from those at time 2; right_x: from left2 to right2."""
+    bits = popcount(words_left1[0, y, x] ^ words_left2[0, at_y, at_x])
+    bits += popcount(words_left1[1, y, x] ^ words_left2[1, at_y, at_x])
+    cost = min(bits / largest, 1.0)
+    if 0 <= at_x + right_x < words_right2.shape[2]:
+        bits = popcount(words_left1[0, y, x] ^ words_right2[0, at_y, at_x + right_x])
+        bits += popcount(words_left1[1, y, x] ^ words_right2[1, at_y, at_x + right_x])
+        cost = 0.5 * (cost + min(bits / largest, 1.0))
+    return cost
+
+
 @rowwise
 def _costs(
     first: int, last: int, candidates: np.ndarray, disparity: np.ndarray, words_left1: np.ndarray,
@@ -88,15 +104,28 @@ def _costs(
                         break
                     if at_x < 0 or at_x >= width or at_y < 0 or at_y >= height:
                         continue
-                    bits = popcount(words_left1[0, y, x] ^ words_left2[0, at_y, at_x])
-                    bits += popcount(words_left1[1, y, x] ^ words_left2[1, at_y, at_x])
-                    cost = min(bits / largest, 1.0)
-                    if 0 <= at_x + right_x < width:
-                        bits = popcount(words_left1[0, y, x] ^ words_right2[0, at_y, at_x + right_x])
-                        bits += popcount(words_left1[1, y, x] ^ words_right2[1, at_y, at_x + right_x])
-                        cost = 0.5 * (cost + min(bits / largest, 1.0))
+                    cost = _disagreement(words_left1, words_left2, words_right2, y, x, at_y, at_x, right_x, largest)
                     least = min(least, cost)
                 costs[k, y, x] = least
+
+
+@rowwise
+def _costs_of_ends(
+    first: int, last: int, places: np.ndarray, ends: np.ndarray, words_left1: np.ndarray, words_left2: np.ndarray,
+    words_right2: np.ndarray, largest: np.float32, costs: np.ndarray,
+) -> None:  # fmt: skip
+    height, width = words_left1.shape[1:]
+    for n in range(first, last):
+        costs[n] = np.nan
+        to_x, to_y = np.rint(ends[n, 0]), np.rint(ends[n, 1])
+        if to_x >= 0 and to_x < width and to_y >= 0 and to_y < height and np.isfinite(ends[n, 2]):
+            right_x = int(np.rint(ends[n, 0] - ends[n, 2]) - to_x)
+            costs[n] = 1.0
+            for at_y in range(max(int(to_y) - 1, 0), min(int(to_y) + 2, height)):
+                for at_x in range(max(int(to_x) - 1, 0), min(int(to_x) + 2, width)):
+                    x, y = places[n, 0], places[n, 1]
+                    cost = _disagreement(words_left1, words_left2, words_right2, y, x, at_y, at_x, right_x, largest)
+                    costs[n] = min(costs[n], cost)
 
 
 @inlined
@@ -259,6 +288,30 @@ def motion_costs(
             costs[k] = np.where(exists, cv2.blur(np.minimum(costs[k], 1), (config.window, config.window)), FORBIDDEN)
 
     over_bands(average, range(len(costs) + 1))
+    return costs
+
+
+def costs_of_ends(
+    places: np.ndarray, ends: np.ndarray, words: tuple[np.ndarray, np.ndarray, np.ndarray], config: FusionConfig
+) -> np.ndarray:
+    """Cost in [0, 1] of single pixels' motions, each the least of the place where it leads and the eight around that.
+
+    Parameters
+    ----------
+    places : np.ndarray
+        (N, 2) int, x and y in left1.
+    ends : np.ndarray
+        (N, 3) x, y and disparity at time 2.
+    words : tuple of three np.ndarray
+        See `motion_costs`.
+
+    Returns
+    -------
+    np.ndarray
+        (N,) float32; NaN where a motion leads out of the image.
+    """
+    costs = np.empty(len(places), np.float32)
+    over_rows(_costs_of_ends, len(places), places, ends, *words, np.float32(config.truncation * BITS), costs)
     return costs
 
 

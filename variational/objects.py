@@ -2,30 +2,41 @@
 
 Where no candidate motion makes the images agree, although the pixels should be seen at time 2, something moved in a way
 that dense flow could not follow, mostly too far. Patches of each connected surface of such pixels are looked for in left2
-(variational.patches) and give it a first rigid motion. Left2 is then seen through that motion, where little is left to
-move: dense inverse search measures it, a better fit follows, and so once more. Whether the motion is any good is for the
-fusion to say.
+(variational.patches) and propose a few motions. Left2 is then seen through each of them, where little is left to move:
+dense inverse search measures it, a better fit follows, and so once more. Of all these motions the surface takes the one
+under which the images agree best, if they agree better than so far by more than chance.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
+from operator import itemgetter
 
 import cv2
 import numpy as np
 
 from variational.frames import Frames
+from variational.fusion import FusionConfig, costs_of_ends
 from variational.initialise import Start, dense_inverse_search
 from variational.patches import Patches, PatchesConfig
-from variational.rigid import RigidMotion, fit_surface
+from variational.rigid import RigidMotion, apply_homography, displacements, thin
 from variational.state import D1, C
+from variational.surface_motion import fit_from, translations
 
 MARGIN = 16
 """Pixels around a surface that dense inverse search sees too."""
-COARSE_PX = 4.0
+PATCHES_PX = 4.0
 """How exactly the patches' places are known: as their pixels, for they turn."""
+FLOW_PX = (2.0, 1.0, 1.0, 1.0)
+"""How exactly those of dense inverse search are known, the first time and again."""
+FOLLOWED = 2
+"""Proposals that dense inverse search is spent on."""
 ASTRAY_PX = 2.0
 """A surface whose patches are nearer to where its motion leads is not lost."""
-FINE_PX = 2.0
-"""How exactly those of dense inverse search are known, the first time."""
+COMPARED = 3000
+"""Pixels of a surface at which the images are compared, at most."""
+INDEPENDENT_PX = 10
+"""How far apart two comparisons have little in common: census words are 9 pixels wide."""
 
 
 @dataclass(frozen=True)
@@ -50,14 +61,10 @@ class ObjectsConfig:
         Patches of a surface that are looked for, at most.
     least_places : int
         Fewest of them that must be found again.
-    seen : float
-        Least share of them that must follow the first motion.
+    proposals : int
+        Translations that a fit begins with, at most.
     flow_px : int
         Side of the square whose area dense inverse search reduces a surface and its surroundings to.
-    least_points : int
-        Fewest points of dense inverse search that the last motion is fitted to.
-    inliers : float
-        Share of its points that a motion must explain.
     patches
         Settings of the patches.
     """
@@ -70,10 +77,8 @@ class ObjectsConfig:
     jump_px: float = 1.5
     places: int = 80
     least_places: int = 5
-    seen: float = 0.15
+    proposals: int = 6
     flow_px: int = 160
-    least_points: int = 30
-    inliers: float = 0.25
     patches: PatchesConfig = field(default_factory=PatchesConfig)
 
 
@@ -133,10 +138,11 @@ def follow(
     middle = np.median(disparity[surface])
     # what lies far before or behind the surface would be torn away from it: moved as if it lay there
     near = np.where(np.abs(disparity[part] - middle) < 0.3 * middle + 5, disparity[part], middle)
-    y, x = np.indices(near.shape) + np.array([top, left])[:, None, None]
-    moved = np.stack([x, y, near, np.ones_like(near)], axis=-1) @ homography.T
-    with np.errstate(all="ignore"):  # points that come to lie beside the camera
-        to = np.nan_to_num((moved[..., :2] / moved[..., 3:]).astype(np.float32), posinf=-1, neginf=-1)
+    corner = np.eye(4)
+    corner[:2, 3] = left, top
+    u, v = displacements((homography @ corner)[None], np.zeros((1, *near.shape), np.int32), near)[0, 1:]
+    y, x = np.indices(near.shape, np.float32)
+    to = np.nan_to_num(np.dstack([x + u, y + v]), nan=-1, posinf=-1, neginf=-1)  # points that come to lie beside the camera
     seen = cv2.remap(left2, to, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     flow = _flow_at_most(np.ascontiguousarray(left1[part]), seen, config.flow_px)
     points = np.argwhere(surface[part])
@@ -146,10 +152,11 @@ def follow(
     return np.hstack([points[:, ::-1] + (left, top), places]).astype(np.float64)
 
 
-def find_objects(
-    start: Start, state: np.ndarray, frames: Frames, surfaces: list[np.ndarray], projection: np.ndarray, config: ObjectsConfig
-) -> list[RigidMotion]:
-    """Rigid motions of surfaces that dense flow lost.
+def searches(
+    start: Start, state: np.ndarray, frames: Frames, surfaces: list[np.ndarray],
+    words: tuple[np.ndarray, np.ndarray, np.ndarray], projection: np.ndarray, config: ObjectsConfig, fusion: FusionConfig,
+) -> list[Callable[[], RigidMotion | None]]:  # fmt: skip
+    """For each surface that dense flow lost, what finds its rigid motion; they do not depend on one another.
 
     Parameters
     ----------
@@ -160,44 +167,80 @@ def find_objects(
     frames : Frames
     surfaces : list of np.ndarray
         (H, W) bool masks.
+    words : tuple of three np.ndarray
+        (2, H, W) uint64 census words of left1, left2 and right2.
     projection : np.ndarray
         (4, 4) of the camera.
     config : ObjectsConfig
+    fusion : FusionConfig
+        How motions are compared.
 
     Returns
     -------
-    list of RigidMotion
-        One for each surface that is seen again and moves rigidly.
+    list of functions
+        Each gives the motion of a surface that is seen again elsewhere than its motion so far leads to, and moves rigidly;
+        None of another.
     """
     if not surfaces:
         return []
-    seen = Patches(frames.left1, frames.left2, config.patches).follow(surfaces, config.places)
-    found = zip(surfaces, seen, strict=True)
-    motions = (_fit(start, state, frames, surface, *patches, projection, config) for surface, patches in found)
-    return [motion for motion in motions if motion is not None]
+
+    def find(surface: np.ndarray, seen: np.ndarray) -> RigidMotion | None:
+        x, y = np.rint(seen[:, :2]).astype(np.intp).T
+        astray = np.abs(seen[:, 2:] - seen[:, :2] - state[C + 1 :, y, x].T).max(axis=1)
+        if len(seen) < config.least_places or np.median(astray) < ASTRAY_PX:
+            return None  # a shadow, a highlight: the images disagree, the motion is right
+        first, second = _ends(start, state[D1], seen, matched=False)
+        proposed = translations(first, second, projection, PATCHES_PX, config.proposals)
+        gain_of = _judge(state, surface, words, projection, fusion)
+        fitted = (fit_from(each, first, second, projection, PATCHES_PX, translates=True) for each in proposed)
+        begun = sorted(((gain_of(each), each) for each in fitted if each is not None), key=itemgetter(0), reverse=True)
+        improved = (_improved(*each, start, state[D1], frames, surface, projection, gain_of, config) for each in begun[:FOLLOWED])
+        gain, best = max(improved, key=itemgetter(0), default=(0.0, np.eye(4)))
+        return RigidMotion(best, projection @ best @ np.linalg.inv(projection), surface) if gain > 0 else None
+
+    patches = Patches(frames.left1, frames.left2, config.patches).follow(surfaces, config.places)
+    return [partial(find, *each) for each in zip(surfaces, patches, strict=True)]
 
 
-def _fit(
-    start: Start, state: np.ndarray, frames: Frames, surface: np.ndarray, seen: np.ndarray, looked_for: int,
-    projection: np.ndarray, config: ObjectsConfig,
-) -> RigidMotion | None:  # fmt: skip
-    """The motion of a surface, if it is seen again elsewhere than its motion so far leads to, and moves rigidly."""
-    disparity = state[D1]
+def _improved(
+    gain: float, transform: np.ndarray, start: Start, disparity: np.ndarray, frames: Frames, surface: np.ndarray,
+    projection: np.ndarray, gain_of: Callable[[np.ndarray], float], config: ObjectsConfig,
+) -> tuple[float, np.ndarray]:  # fmt: skip
+    """A surface's gain and transform (4, 4), fitted to what dense flow measures from it, as long as the gain rises."""
     left1, _, left2, _ = frames.grey
-    x, y = np.rint(seen[:, :2]).astype(np.intp).T
-    astray = np.abs(seen[:, 2:] - seen[:, :2] - state[C + 1 :, y, x].T).max(axis=1)
-    if not len(seen) or np.median(astray) < ASTRAY_PX:
-        return None  # a shadow, a highlight: the images disagree, the motion is right
-    first, second = _ends(start, disparity, seen, matched=False)
-    least = max(config.least_places, config.seen * looked_for)
-    for tolerance_px in (COARSE_PX, FINE_PX):
-        motion = fit_surface(surface, first, second, projection, least, tolerance_px)
-        if motion is None:
-            return None
-        followed = follow(left1, left2, surface, disparity, motion.homography, config)
-        first, second = _ends(start, disparity, followed, matched=tolerance_px == FINE_PX)
-        least = config.inliers * len(first)
-    return fit_surface(surface, first, second, projection, least) if len(first) >= config.least_points else None
+    for turn, tolerance_px in enumerate(FLOW_PX):
+        followed = follow(left1, left2, surface, disparity, projection @ transform @ np.linalg.inv(projection), config)
+        ends = _ends(start, disparity, followed, matched=turn > 0)
+        fitted = fit_from(transform, *ends, projection, tolerance_px, translates=False)
+        if fitted is None:
+            break
+        better = gain_of(fitted)
+        if better <= gain:
+            break
+        gain, transform = better, fitted
+    return gain, transform
+
+
+def _judge(
+    state: np.ndarray, surface: np.ndarray, words: tuple[np.ndarray, np.ndarray, np.ndarray], projection: np.ndarray,
+    config: FusionConfig,
+) -> Callable[[np.ndarray], float]:  # fmt: skip
+    """How much better the images agree on a surface under a transform (4, 4) than under the state, less a standard error."""
+    at = thin(surface.ravel(), COMPARED)
+    y, x = np.unravel_index(at, surface.shape)
+    d1, change, u, v = (state[k].ravel()[at] for k in (D1, C, C + 1, C + 2))
+    places, points = np.column_stack([x, y]), np.column_stack([x, y, d1])
+    now = costs_of_ends(places, points + np.column_stack([u, v, change]), words, config)
+    now[np.isnan(now)] = config.outside_cost
+    error = INDEPENDENT_PX / np.sqrt(np.count_nonzero(surface))
+
+    def gain_of(transform: np.ndarray) -> float:
+        ends = apply_homography(projection @ transform @ np.linalg.inv(projection), points)
+        gain = now - costs_of_ends(places, ends, words, config)
+        gain[np.isnan(gain)] = 0  # outside of the image nothing is compared
+        return float(gain.mean() - error * gain.std())
+
+    return gain_of
 
 
 def _ends(

@@ -47,6 +47,10 @@ class PatchesConfig:
     ratio : float
         A displacement is believed if all but those beside it score less than this share of its score: in a repeated pattern
         others score as well, and the way back leads home from each of them. 1 believes all.
+    colour : float
+        Difference of colour (its length, channels in [0, 1]) at which a score has fallen to half.
+    plain : float
+        Share of a score that is for the colour alone: a surface without texture is known by its colour and its extent.
     """
 
     pixels: int = 16_000
@@ -56,10 +60,14 @@ class PatchesConfig:
     neighbours: float = 5.0
     return_px: float = 1.5
     ratio: float = 0.9
+    colour: float = 0.1
+    plain: float = 0.2
 
     def __post_init__(self) -> None:
         if self.pixels < 1 or self.radius < 1 or not 0 <= self.votes <= 3:
             raise ValueError("PatchesConfig needs pixels >= 1, radius >= 1 and votes between 0 and 3")
+        if self.colour <= 0 or not 0 <= self.plain <= 1:
+            raise ValueError("PatchesConfig needs colour > 0 and plain between 0 and 1")
 
 
 @rowwise
@@ -90,27 +98,46 @@ def _describe(first: int, last: int, padded: np.ndarray, radius: int, words: np.
                 words[y, x, k] = np.rint(scale * words[y, x, k])
 
 
-def describe(image: np.ndarray, shape: tuple[int, int], radius: int) -> np.ndarray:
-    """(h, w, n) float32 patches around the pixels of an image (H, W, channels) made smaller to `shape` (h, w)."""
+@dataclass(frozen=True, eq=False)
+class Described:
+    """An image made smaller, and the patches around its pixels.
+
+    Parameters
+    ----------
+    colours : np.ndarray
+        (h, w, channels) float32.
+    words : np.ndarray
+        (h, w, n) float32, see `describe`.
+    """
+
+    colours: np.ndarray
+    words: np.ndarray
+
+
+def describe(image: np.ndarray, shape: tuple[int, int], radius: int) -> Described:
+    """An image (H, W, channels) made smaller to `shape` (h, w), and the patches of 2 radius + 1 pixels around its pixels."""
     small = cv2.resize(image, shape[::-1], interpolation=cv2.INTER_AREA)
     small = cv2.GaussianBlur(small, (0, 0), 0.7).reshape(*shape, -1).astype(np.float32)  # OpenCV drops a single channel
     padded = np.pad(small, ((radius, radius), (radius, radius), (0, 0)), mode="edge")
     words = np.empty((*shape, (2 * radius + 1) ** 2 * small.shape[2]), np.float32)
     over_rows(_describe, shape[0], padded, radius, words)
-    return words
+    return Described(small, words)
 
 
 @rowwise
 def _score(
-    first: int, last: int, products: np.ndarray, places: np.ndarray, reach: int, scores: np.ndarray, pooled: np.ndarray
-) -> None:
+    first: int, last: int, products: np.ndarray, colours1: np.ndarray, colours2: np.ndarray, places: np.ndarray, reach: int,
+    half: np.float32, plain: np.float32, scores: np.ndarray, pooled: np.ndarray,
+) -> None:  # fmt: skip
     """scores (N, S + 2, S + 2) of the places (N, 2: x, y) at each displacement, S = 2 reach + 1, inside a border of zeros.
 
-    A score is the correlation to the power of 1.5, 0 if negative or outside: what agrees well counts for more.
-    products (N, h, w): of the places' patches with all of the other image; pooled (N, S, S): maximum of scores over 3 x 3.
+    A score is the correlation to the power of 1.5, 0 if negative: what agrees well counts for more; and a share of `plain`
+    for the colour alone. Colours that differ by `half` take half of it. Outside of the image it is 0. products (N, h, w): of
+    the places' patches with all of the other image; pooled (N, S, S): maximum of scores over 3 x 3.
     """
     _, height, width = products.shape
     side, zero, unit = 2 * reach + 1, np.float32(0), np.float32(1 / _NORM**2)
+    one, sharpness = np.float32(1), np.float32(1) / half**2
     for n in range(first, last):
         x, y = places[n, 0], places[n, 1]
         for i in range(side + 2):
@@ -123,7 +150,11 @@ def _score(
             i = to_y - (y - reach) + 1
             for j in range(size):
                 correlation = max(unit * products[n, to_y, start + j], zero)
-                scores[n, i, at + j] = np.rint(np.float32(_SCORE) * correlation * np.sqrt(correlation))
+                apart = zero
+                for c in range(colours1.shape[2]):
+                    apart += (colours1[y, x, c] - colours2[to_y, start + j, c]) ** 2
+                score = (plain + (one - plain) * correlation * np.sqrt(correlation)) / (one + sharpness * apart)
+                scores[n, i, at + j] = np.rint(np.float32(_SCORE) * score)
         for i in range(side):
             for j in range(side):
                 above = max(scores[n, i, j], scores[n, i, j + 1], scores[n, i, j + 2])
@@ -167,7 +198,7 @@ def _vertex(below: np.float32, top: np.float32, above: np.float32) -> np.float32
 
 
 def displacements_of(
-    words1: np.ndarray, words2: np.ndarray, places: np.ndarray, groups: np.ndarray, reach: int, config: PatchesConfig
+    image1: Described, image2: Described, places: np.ndarray, groups: np.ndarray, reach: int, config: PatchesConfig
 ) -> np.ndarray:
     """(N, 2) float32 displacements (x, y) of the places (N, 2) int, pixels of the smaller image; NaN where unclear.
 
@@ -177,8 +208,10 @@ def displacements_of(
     scores, pooled, votes = (np.empty((count, each, each), np.float32) for each in (side + 2, side, side))
     edges = [*range(0, count, _STACK), count]
     # all at once: the threads of a product of matrices idle on for a while after it, and take time from other stages
-    products = words1[places[:, 1], places[:, 0]] @ words2.reshape(-1, words2.shape[2]).T
-    over_bands(_score, edges, products.reshape(count, *words2.shape[:2]), places, reach, scores, pooled)
+    products = image1.words[places[:, 1], places[:, 0]] @ image2.words.reshape(-1, image2.words.shape[2]).T
+    products = products.reshape(count, *image2.words.shape[:2])
+    half, plain = np.float32(config.colour), np.float32(config.plain)
+    over_bands(_score, edges, products, image1.colours, image2.colours, places, reach, half, plain, scores, pooled)
     for group in np.unique(groups):
         mine = groups == group
         together = _shares(places[mine], config) @ pooled[mine].reshape(-1, side * side)
@@ -212,29 +245,28 @@ class Patches:
         self.small = max(1, round(height / factor)), max(1, round(width / factor))
         self.reach = min(max(1, int(config.reach * self.small[1])), _MOST_REACH)
         self.scale = np.array([width / self.small[1], height / self.small[0]])
-        self.words = [describe(image, self.small, config.radius) for image in (image1, image2)]
+        self.images = [describe(image, self.small, config.radius) for image in (image1, image2)]
 
-    def follow(self, surfaces: list[np.ndarray], most: int) -> list[tuple[np.ndarray, int]]:
+    def follow(self, surfaces: list[np.ndarray], most: int) -> list[np.ndarray]:
         """Look for at most so many patches of each surface (H, W) bool, spread evenly over it.
 
         Returns
         -------
-        list of (ends, looked_for)
-            For each surface: (N, 4) float64, x, y in image1 and in image2 of those that are seen again, in pixels; and how many
-            were looked for.
+        list of np.ndarray
+            For each surface: (N, 4) float64, x, y in image1 and in image2 of those that are seen again, in pixels.
         """
         found = [self._places(surface, most) for surface in surfaces]
         groups = np.repeat(np.arange(len(found)), [len(places) for places in found])
         places = np.concatenate([*found, np.empty((0, 2), np.intp)])
-        words1, words2 = self.words
-        there = places + displacements_of(words1, words2, places, groups, self.reach, self.config)
+        image1, image2 = self.images
+        there = places + displacements_of(image1, image2, places, groups, self.reach, self.config)
         clear = np.isfinite(there).all(axis=1)
         places, there, groups = places[clear], there[clear], groups[clear]
         nearest = np.clip(np.rint(there).astype(np.intp), 0, np.array(self.small[::-1]) - 1)
-        back = nearest + displacements_of(words2, words1, nearest, groups, self.reach, self.config)
+        back = nearest + displacements_of(image2, image1, nearest, groups, self.reach, self.config)
         home = (np.abs(back - places) <= self.config.return_px).all(axis=1)
         ends = np.hstack([(ends + 0.5) * self.scale - 0.5 for ends in (places, there)])
-        return [(ends[home & (groups == group)], len(places)) for group, places in enumerate(found)]
+        return [ends[home & (groups == group)] for group in range(len(found))]
 
     def _places(self, surface: np.ndarray, most: int) -> np.ndarray:
         """(N, 2) x, y in the smaller image."""

@@ -19,7 +19,7 @@ from variational.fusion import FusionConfig, choose, motion_costs
 from variational.initialise import Start, sample
 from variational.jit import over_rows, rowwise, side_by_side
 from variational.matching import MatchingConfig, StereoMatch
-from variational.objects import ObjectsConfig, find_objects, unexplained_surfaces
+from variational.objects import ObjectsConfig, searches, unexplained_surfaces
 from variational.planes import PlanesConfig, plane_disparities
 from variational.rigid import Correspondences, RigidConfig, RigidMotion, displacements, find_motions
 from variational.self_calibration import guess_camera
@@ -209,19 +209,17 @@ def propose(
     if not evidence.fill:
         return Proposal(state, labels, motions, cost, known)
 
-    def lost_objects() -> list[RigidMotion]:
-        surfaces = unexplained_surfaces(state[D1], cost, project_visibility(state), start.match1.matched, objects)
-        return find_objects(start, state, frames, surfaces, known.projection(), objects)
-
+    surfaces = unexplained_surfaces(state[D1], cost, project_visibility(state), start.match1.matched, objects)
     homographies = np.stack([motion.homography for motion in motions])
-    disparity, found = side_by_side(
-        lambda: refill(match1, start.match2, grey, labels, homographies, matching, evidence), lost_objects
+    disparity, *found = side_by_side(
+        lambda: refill(match1, start.match2, grey, labels, homographies, matching, evidence),
+        *searches(start, state, frames, surfaces, words, known.projection(), objects, fusion),
     )
     if edges.reach_px:
         sides = disparity.ravel()[other_sides(disparity, frames.left1, edges)]
         disparity = cv2.medianBlur(sides, 3)  # each pixel decided for itself
     state[D1] = disparity
-    motions += found
+    motions += [motion for motion in found if motion is not None]
     labels, cost = fuse(2)
     return Proposal(state, labels, motions, cost, known)
 

@@ -10,6 +10,7 @@ Without a calibration the camera is the one under which the correspondences move
 """
 
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -235,44 +236,67 @@ def twist(step: np.ndarray) -> np.ndarray:
     return transform
 
 
+def gauss_newton_step(
+    transform: np.ndarray, points: np.ndarray, second: np.ndarray, projection: np.ndarray,
+    weigh: Callable[[np.ndarray], np.ndarray], turning: float = 0.0,
+) -> np.ndarray | None:  # fmt: skip
+    """One step of a rigid transform (4, 4) towards less of the weighed squares of the distance in (x, y, disparity).
+
+    Parameters
+    ----------
+    transform : np.ndarray
+        (4, 4), a twist from the left changes it.
+    points : np.ndarray
+        (N, 3) at time 1, metres.
+    second : np.ndarray
+        (N, 3) x, y, disparity at time 2.
+    projection : np.ndarray
+        (4, 4), StereoCamera.projection().
+    weigh : function
+        Residuals (N, 3) to their weights (N, 3).
+    turning : float
+        Weight of the squared angle of rotation, px^2: where the points do not tell, a motion does not turn.
+
+    Returns
+    -------
+    np.ndarray or None
+        (4, 4); None where the points do not fix a motion.
+    """
+    moved = points @ transform[:3, :3].T + transform[:3, 3]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        residual = projected(moved, projection) - second
+        weight = weigh(residual)
+        usable = (moved[:, 2] > 0) & np.isfinite(weight).all(axis=1)
+    residual, root = residual[usable], np.sqrt(weight[usable])
+    if len(root) < 3:
+        return None
+    jacobian = (rigid_derivatives(moved[usable], projection) * root.T).reshape(6, -1)
+    normal, gradient = jacobian @ jacobian.T, jacobian @ (residual * root).T.ravel()
+    if turning:
+        normal[3:, 3:] += turning * np.eye(3)
+        gradient[3:] += turning * cv2.Rodrigues(transform[:3, :3])[0][:, 0]
+    scaling = np.sqrt(np.diag(normal))
+    if not scaling.all() or np.linalg.cond(normal / np.outer(scaling, scaling)) > 1e12:
+        return None
+    return twist(-np.linalg.solve(normal, gradient)) @ transform
+
+
 def _gauss_newton(
     transform: np.ndarray, points: np.ndarray, second: np.ndarray, projection: np.ndarray, iterations: int,
     scale_px: float,
 ) -> np.ndarray | None:  # fmt: skip
-    """Minimise the Geman-McClure penalty of the distance in (x, y, disparity) over a twist from the left."""
+    """Minimise the Geman-McClure penalty of the distance in (x, y, disparity)."""
+
+    def weigh(residual: np.ndarray) -> np.ndarray:
+        weight = 1 / (1 + (residual**2).sum(axis=1) / scale_px**2) ** 2
+        return np.repeat(weight[:, None], 3, axis=1)
+
     for _ in range(iterations):
-        moved = points @ transform[:3, :3].T + transform[:3, 3]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            residual = projected(moved, projection) - second
-            weight = 1 / (1 + (residual**2).sum(axis=1) / scale_px**2) ** 2
-            usable = (moved[:, 2] > 0) & np.isfinite(weight)
-        residual, weight = residual[usable], weight[usable]
-        if len(weight) < 6:
+        step = gauss_newton_step(transform, points, second, projection, weigh)
+        if step is None:
             return None
-        root = np.sqrt(weight)
-        jacobian = (rigid_derivatives(moved[usable], projection) * root).reshape(6, -1)
-        weighted = (residual.T * root).ravel()
-        normal = jacobian @ jacobian.T
-        scaling = np.sqrt(np.diag(normal))
-        if not scaling.all() or np.linalg.cond(normal / np.outer(scaling, scaling)) > 1e12:
-            return None
-        step = -np.linalg.solve(normal, jacobian @ weighted)
-        transform = twist(step) @ transform
+        transform = step
     return transform
-
-
-def fit_surface(
-    surface: np.ndarray, first: np.ndarray, second: np.ndarray, projection: np.ndarray, least: float, tolerance_px: float = 1.0
-) -> RigidMotion | None:
-    """The motion of a surface (H, W) bool, if at least so many of its points follow it within twice the tolerance; else as
-    `fit_motion`."""
-    transform = fit_motion(first, second, projection, tolerance_px)
-    if transform is None:
-        return None
-    homography = projection @ transform @ np.linalg.inv(projection)
-    moved = np.column_stack([first, np.ones(len(first))]) @ homography.T
-    distance = np.linalg.norm(moved[:, :3] / moved[:, 3:] - second, axis=1)
-    return RigidMotion(transform, homography, surface) if np.sum(distance < 2 * tolerance_px) >= least else None
 
 
 def thin(valid: np.ndarray, count: int) -> np.ndarray:

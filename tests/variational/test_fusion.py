@@ -6,7 +6,7 @@ import pytest
 
 from tests import naive_matching
 from variational.census import census
-from variational.fusion import FORBIDDEN, FusionConfig, _chains, choose, motion_costs
+from variational.fusion import FORBIDDEN, FusionConfig, _chains, choose, costs_of_ends, motion_costs
 from variational.visibility import backward_flow, project_visibility
 
 RNG_SEED = 7
@@ -91,6 +91,40 @@ def test_a_rigid_motion_may_lead_one_pixel_beside() -> None:
     assert costs[-2:].min() > 0.5
     candidates[0, 1] += 1
     assert motion_costs(candidates, disparity, words, FusionConfig())[0, 12:-12, 12:-12].min() > 0.5
+
+
+def test_costs_of_single_pixels_equal_their_plain_twin() -> None:
+    random, (height, width) = np.random.default_rng(8), (19, 27)
+    words = tuple(random.integers(0, 2**63, (2, height, width), np.uint64) for _ in range(3))
+    places = np.column_stack([random.integers(0, width, 300), random.integers(0, height, 300)])
+    ends = random.uniform((-3, -3, -4), (width + 2, height + 2, 12), (300, 3))
+    words[1][:, 5:9, 8:14] = words[0][:, 2:6, 3:9]
+    words[2][:, 5:9, 4:10] = words[0][:, 2:6, 3:9]
+    places[0], ends[0] = (4, 3), (9, 6, 4)  # equal in both images
+    places[1], ends[1] = (4, 3), (10, 5, 4)  # beside
+    places[2], ends[2] = (4, 3), (11, 6, 4)  # two pixels: too far
+    ends[3], ends[4] = np.nan, (9, 6, np.inf)
+    expected = np.full(300, np.nan, np.float32)
+    for n, ((x, y), end) in enumerate(zip(places, ends, strict=True)):
+        if not np.isfinite(end).all():
+            continue
+        to_x, to_y = np.rint(end[:2]).astype(int)
+        if not (0 <= to_x < width and 0 <= to_y < height):
+            continue
+        apart = int(np.rint(end[0] - end[2])) - to_x
+        costs = []
+        for at_y in range(max(to_y - 1, 0), min(to_y + 2, height)):
+            for at_x in range(max(to_x - 1, 0), min(to_x + 2, width)):
+                compared = [words[1][:, at_y, at_x]]
+                if 0 <= at_x + apart < width:
+                    compared.append(words[2][:, at_y, at_x + apart])
+                bits = [sum(int(a ^ b).bit_count() for a, b in zip(words[0][:, y, x], each, strict=True)) for each in compared]
+                costs.append(np.mean([min(b / (0.4 * 124), 1) for b in bits]))
+        expected[n] = min(costs)
+    found = costs_of_ends(places, ends, words, FusionConfig())
+    assert found[0] == found[1] == 0 < found[2]
+    assert np.isnan(found[3:5]).all()
+    np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
 @pytest.mark.parametrize(("margin", "height", "spread_px"), [(0.5, 29, 3), (1.5, 29, 3), (1.0, 100, 3), (1.0, 100, 40)])

@@ -5,12 +5,14 @@ import numpy as np
 import pytest
 
 from variational.camera import StereoCamera
+from variational.census import census
 from variational.frames import Frames
+from variational.fusion import FusionConfig
 from variational.initialise import Start
 from variational.matching import StereoMatch
-from variational.objects import ObjectsConfig, find_objects, follow, unexplained_surfaces
+from variational.objects import ObjectsConfig, follow, searches, unexplained_surfaces
 from variational.patches import PatchesConfig
-from variational.rigid import displacements
+from variational.rigid import RigidMotion, displacements
 
 SHAPE = (120, 200)
 PROJECTION = StereoCamera(150.0, 160.0, 90.0, 70.0, 0.5).projection()
@@ -41,6 +43,13 @@ def start_with(disparity: np.ndarray, matched: np.ndarray) -> Start:
     words = np.zeros((2, *SHAPE), np.uint64)
     match = StereoMatch(disparity, matched, words, words, 30)
     return Start(np.zeros((5, *SHAPE), np.float32), np.zeros((*SHAPE, 2), np.float32), match, match)
+
+
+def found_in(start: Start, state: np.ndarray, frames: Frames, surfaces: list[np.ndarray]) -> list[RigidMotion]:
+    left1, _, left2, right2 = frames.grey
+    words = census(left1), census(left2), census(right2)
+    found = [search() for search in searches(start, state, frames, surfaces, words, PROJECTION, FAR, FusionConfig())]
+    return [motion for motion in found if motion is not None]
 
 
 def standing(disparity: np.ndarray) -> np.ndarray:
@@ -83,7 +92,7 @@ def test_a_lost_box_gets_its_motion() -> None:
     disparity2 = np.full(SHAPE, 5, np.float32)
     disparity2[50 + SHIFT[1] : 90 + SHIFT[1], 60 + SHIFT[0] : 110 + SHIFT[0]] = 12
     start = start_with(disparity2, np.ones(SHAPE, bool))
-    (motion,) = find_objects(start, standing(disparity), frames, [surface], PROJECTION, FAR)
+    (motion,) = found_in(start, standing(disparity), frames, [surface])
     labels = np.zeros((1, *SHAPE), np.int32)
     change, u, v = displacements(motion.homography[None], labels, disparity)[0][:, surface]
     assert abs(np.median(change)) < 0.2
@@ -92,19 +101,30 @@ def test_a_lost_box_gets_its_motion() -> None:
     np.testing.assert_array_equal(motion.support, surface)
 
 
-@pytest.mark.parametrize("case", ["no surface", "nothing rigid", "nothing matched", "nothing seen again", "not lost"])
+@pytest.mark.parametrize("matched", [False, True])
+def test_wrong_disparities_at_time_2_do_not_hide_it(matched: bool) -> None:
+    left1, left2, surface = jumping_box()
+    frames = Frames(*(image[..., None] for image in (left1, left1, left2, left2)))
+    disparity = np.full(SHAPE, 12, np.float32)
+    disparity2 = np.random.default_rng(5).uniform(3, 60, SHAPE).astype(np.float32)
+    (motion,) = found_in(start_with(disparity2, np.full(SHAPE, matched)), standing(disparity), frames, [surface])
+    flow = displacements(motion.homography[None], np.zeros((1, *SHAPE), np.int32), disparity)[0][1:, surface]
+    assert np.linalg.norm(np.median(flow, axis=1) - SHIFT) < 2
+
+
+@pytest.mark.parametrize("case", ["no surface", "nothing seen again", "not lost", "no better than so far"])
 def test_nothing_is_invented(case: str) -> None:
     left1, left2, surface = jumping_box()
-    random = np.random.default_rng(5).uniform(3, 60, SHAPE).astype(np.float32)
-    disparity2 = random if case == "nothing rigid" else np.full(SHAPE, 12, np.float32)
-    start = start_with(disparity2, np.full(SHAPE, case != "nothing matched"))
+    start = start_with(np.full(SHAPE, 12, np.float32), np.ones(SHAPE, bool))
+    if case == "no better than so far":  # the box is seen where it went, and where it was
+        left2 = np.where(surface, left1, left2)
     left2 = texture(8) if case == "nothing seen again" else left2
     surfaces = [] if case == "no surface" else [surface]
     state = standing(np.full(SHAPE, 12, np.float32))
     if case == "not lost":
         state[3], state[4] = SHIFT
     frames = Frames(*(image[..., None] for image in (left1, left1, left2, left2)))
-    assert find_objects(start, state, frames, surfaces, PROJECTION, FAR) == []
+    assert found_in(start, state, frames, surfaces) == []
 
 
 def test_the_scene_is_no_object_and_the_largest_comes_first() -> None:

@@ -1,0 +1,89 @@
+"""Motions of one surface from few points: translations that points propose, fits that bear wrong places and disparities."""
+
+import numpy as np
+import pytest
+
+from variational.camera import StereoCamera
+from variational.rigid import apply_homography, gauss_newton_step, projected, twist
+from variational.surface_motion import fit_from, translations
+
+PROJECTION = StereoCamera(150.0, 160.0, 90.0, 70.0, 0.5).projection()
+
+
+def moved_points(motion: np.ndarray, count: int, noise_px: float = 0.0, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """(N, 3) x, y, disparity of a tilted surface at both times."""
+    random = np.random.default_rng(seed)
+    first = random.uniform((60, 40, 0), (110, 90, 0), (count, 3))
+    first[:, 2] = 12 + 0.03 * (first[:, 0] - 85) - 0.02 * (first[:, 1] - 65)
+    homography = PROJECTION @ motion @ np.linalg.inv(PROJECTION)
+    return first, apply_homography(homography, first) + random.normal(0, noise_px, (count, 3))
+
+
+def distance(motion: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    return np.linalg.norm(apply_homography(PROJECTION @ motion @ np.linalg.inv(PROJECTION), first) - second, axis=1)
+
+
+MOTION = twist(np.array([0.9, -0.4, 0.3, 0.02, 0.15, -0.2]))
+SHIFT = twist(np.array([0.9, -0.4, 0.3, 0, 0, 0]))
+
+
+def test_a_few_points_are_enough_among_many_that_are_wrong() -> None:
+    """Of forty, twelve are right, in disparity ten; the others went anywhere, nine of them together."""
+    first, second = moved_points(MOTION, 40, noise_px=0.3)
+    truth = second.copy()
+    random = np.random.default_rng(1)
+    second[12:31] += random.uniform(25, 60, (19, 3)) * random.choice((-1, 1), (19, 3))
+    second[31:] = first[31:] + (-30, 20, 1)
+    second[:2, 2] += 20
+    proposed = translations(first, second, PROJECTION, 4.0, 6)
+    fits = [fit_from(each, first, second, PROJECTION, 4.0, translates=True) for each in proposed]
+    errors = [np.median(distance(fit, first, truth)) for fit in fits if fit is not None]
+    assert min(errors) < 1.5
+    best = fits[int(np.argmin(errors))]
+    assert np.median(distance(fit_from(best, first, second, PROJECTION, 1.0, translates=False), first, truth)) < 0.6
+
+
+def test_translations_are_distinct_and_the_most_agreed_on_comes_first() -> None:
+    first, second = moved_points(SHIFT, 30)
+    second[:10] = first[:10] + (40, 5, 0)
+    proposed = translations(first, second, PROJECTION, 2.0, 6)
+    homographies = [PROJECTION @ each @ np.linalg.inv(PROJECTION) for each in proposed]
+    ends = np.array([np.median(apply_homography(each, first) - first, axis=0) for each in homographies])
+    np.testing.assert_allclose(proposed[0], SHIFT, atol=1e-9)
+    assert np.abs(ends[1] - (40, 5, 0)).max() < 3
+    apart = np.abs(ends[:, None, :2] - ends[None, :, :2]).max(axis=2) + 99 * np.eye(len(ends))
+    assert apart.min() >= 1.5 * 2.0
+    assert len(translations(first, second, PROJECTION, 2.0, 1)) == 1
+
+
+def test_turning_costs_where_points_do_not_tell() -> None:
+    """Three points of a small surface, a pixel wrong: without the penalty they are a wild rotation."""
+    first, second = moved_points(SHIFT, 3, seed=4)
+    first[:, :2] = 85 + (first[:, :2] - 85) / 12
+    second = apply_homography(PROJECTION @ SHIFT @ np.linalg.inv(PROJECTION), first)
+    second += np.random.default_rng(2).normal(0, 0.7, (3, 3))
+    points = projected(first, np.linalg.inv(PROJECTION))
+
+    def angle(turning: float) -> float:
+        motion = SHIFT
+        for _ in range(10):
+            motion = gauss_newton_step(motion, points, second, PROJECTION, np.ones_like, turning)
+        return np.degrees(np.arccos(np.clip((np.trace(motion[:3, :3]) - 1) / 2, -1, 1)))
+
+    assert angle(0) > 5 * angle(16.0)
+
+
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_too_few_points_fix_no_motion(count: int) -> None:
+    first, second = moved_points(MOTION, count)
+    assert translations(first, second, PROJECTION, 4.0, 6) == []
+    assert fit_from(MOTION, first, second, PROJECTION, 4.0, translates=True) is None
+
+
+def test_inputs_stay_as_they_are() -> None:
+    first, second = moved_points(MOTION, 20)
+    motion, before = SHIFT.copy(), (SHIFT.copy(), first.copy(), second.copy())
+    translations(first, second, PROJECTION, 4.0, 6)
+    fit_from(motion, first, second, PROJECTION, 4.0, translates=True)
+    for now, then in zip((motion, first, second), before, strict=True):
+        np.testing.assert_array_equal(now, then)
