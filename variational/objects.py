@@ -3,8 +3,8 @@
 Where no candidate motion makes the images agree, although the pixels should be seen at time 2, something moved in a way
 that dense flow could not follow, mostly too far. Patches of each connected surface of such pixels are looked for in left2
 (variational.patches) and propose a few motions. Left2 is then seen through each of them, where little is left to move:
-dense inverse search measures it, a better fit follows, and so once more. Of all these motions the surface takes the one
-under which the images agree best, if they agree better than so far by more than chance.
+dense inverse search measures it, a better fit follows, and so on. Of all these motions the surface takes the one under
+which the images agree best, if they agree better than so far by more than chance.
 """
 
 from collections.abc import Callable
@@ -196,10 +196,15 @@ def searches(
         begun = sorted(((gain_of(each), each) for each in fitted if each is not None), key=itemgetter(0), reverse=True)
         improved = (_improved(*each, start, state[D1], frames, surface, projection, gain_of, config) for each in begun[:FOLLOWED])
         gain, best = max(improved, key=itemgetter(0), default=(0.0, np.eye(4)))
-        return RigidMotion(best, projection @ best @ np.linalg.inv(projection), surface) if gain > 0 else None
+        return RigidMotion(best, _homography(best, projection), surface) if gain > 0 else None
 
     patches = Patches(frames.left1, frames.left2, config.patches).follow(surfaces, config.places)
     return [partial(find, *each) for each in zip(surfaces, patches, strict=True)]
+
+
+def _homography(transform: np.ndarray, projection: np.ndarray) -> np.ndarray:
+    """(4, 4) of (x, y, disparity, 1)."""
+    return projection @ transform @ np.linalg.inv(projection)
 
 
 def _improved(
@@ -209,7 +214,7 @@ def _improved(
     """A surface's gain and transform (4, 4), fitted to what dense flow measures from it, as long as the gain rises."""
     left1, _, left2, _ = frames.grey
     for turn, tolerance_px in enumerate(FLOW_PX):
-        followed = follow(left1, left2, surface, disparity, projection @ transform @ np.linalg.inv(projection), config)
+        followed = follow(left1, left2, surface, disparity, _homography(transform, projection), config)
         ends = _ends(start, disparity, followed, matched=turn > 0)
         fitted = fit_from(transform, *ends, projection, tolerance_px, translates=False)
         if fitted is None:
@@ -235,7 +240,7 @@ def _judge(
     error = INDEPENDENT_PX / np.sqrt(np.count_nonzero(surface))
 
     def gain_of(transform: np.ndarray) -> float:
-        ends = apply_homography(projection @ transform @ np.linalg.inv(projection), points)
+        ends = apply_homography(_homography(transform, projection), points)
         gain = now - costs_of_ends(places, ends, words, config)
         gain[np.isnan(gain)] = 0  # outside of the image nothing is compared
         return float(gain.mean() - error * gain.std())

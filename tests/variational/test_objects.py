@@ -10,7 +10,7 @@ from variational.frames import Frames
 from variational.fusion import FusionConfig
 from variational.initialise import Start
 from variational.matching import StereoMatch
-from variational.objects import ObjectsConfig, follow, searches, unexplained_surfaces
+from variational.objects import ObjectsConfig, _judge, follow, searches, unexplained_surfaces
 from variational.patches import PatchesConfig
 from variational.rigid import RigidMotion, displacements
 
@@ -112,7 +112,7 @@ def test_wrong_disparities_at_time_2_do_not_hide_it(matched: bool) -> None:
     assert np.linalg.norm(np.median(flow, axis=1) - SHIFT) < 2
 
 
-@pytest.mark.parametrize("case", ["no surface", "nothing seen again", "not lost", "no better than so far"])
+@pytest.mark.parametrize("case", ["no surface", "nothing seen again", "not lost", "hardly lost", "no better than so far"])
 def test_nothing_is_invented(case: str) -> None:
     left1, left2, surface = jumping_box()
     start = start_with(np.full(SHAPE, 12, np.float32), np.ones(SHAPE, bool))
@@ -121,10 +121,26 @@ def test_nothing_is_invented(case: str) -> None:
     left2 = texture(8) if case == "nothing seen again" else left2
     surfaces = [] if case == "no surface" else [surface]
     state = standing(np.full(SHAPE, 12, np.float32))
-    if case == "not lost":
-        state[3], state[4] = SHIFT
+    if case in ("not lost", "hardly lost"):  # the latter is for the refinement to mend
+        state[3], state[4] = np.array(SHIFT) + (1.5 if case == "hardly lost" else 0)
     frames = Frames(*(image[..., None] for image in (left1, left1, left2, left2)))
     assert found_in(start, state, frames, surfaces) == []
+
+
+def test_motions_are_judged_against_the_state() -> None:
+    """Nothing to gain on the state's own motion; on a state that leads out of the image, the cost of that."""
+    left1, left2, surface = jumping_box()
+    words = census(left1), census(left2), census(np.roll(left2, -12, axis=1))
+    state, motion = standing(np.full(SHAPE, 12, np.float32)), np.eye(4)
+    state[3], state[4] = SHIFT
+    motion[:2, 3] = SHIFT[0] * 0.5 / 12, SHIFT[1] * 150.0 * 0.5 / 12 / 160.0
+    inside = cv2.erode(surface.astype(np.uint8), np.ones((13, 13))).astype(bool)
+    assert abs(_judge(state, inside, words, PROJECTION, FusionConfig())(motion)) < 0.02
+    state[3] = 500
+    gain = _judge(state, inside, words, PROJECTION, FusionConfig())(motion)
+    assert 0.35 < gain <= 0.4
+    state[3], state[4] = 0, 0
+    assert _judge(state, inside, words, PROJECTION, FusionConfig())(motion) > 0.4
 
 
 def test_the_scene_is_no_object_and_the_largest_comes_first() -> None:

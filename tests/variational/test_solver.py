@@ -2,6 +2,7 @@
 
 import logging
 
+import cv2
 import numba
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from variational.descent import DescentConfig
 from variational.edges import EdgesConfig
 from variational.frames import Frames
 from variational.minimise import DescendConfig
+from variational.objects import ObjectsConfig
 from variational.solver import SolverConfig, solve
 
 CAMERA = StereoCamera(80.0, 80.0, 53.5, 35.5, 0.5)
@@ -141,3 +143,25 @@ def test_no_motion_is_invented_where_nothing_matches(caplog):
         solution = solve(frames, camera=CAMERA)
     assert solution.camera_motion is None
     assert solution.moving is None
+
+
+def test_an_object_that_went_far_is_found_again():
+    """Far beyond what dense flow follows; without the search it is lost."""
+    random = np.random.default_rng(11)
+    texture = [cv2.GaussianBlur(random.random(shape, dtype=np.float32), (0, 0), 1.2) for shape in ((200, 400), (48, 64))]
+    background, box = (((each - each.min()) / np.ptp(each))[..., None] for each in texture)
+    views = []
+    for right, down in ((0, 0), (41, -23)):
+        for disparity_of_background, disparity_of_box in ((0, 0), (4, 13)):
+            view = background[20:180, 40 + disparity_of_background : 360 + disparity_of_background].copy()
+            left = 120 + right - disparity_of_box
+            view[70 + down : 118 + down, left : left + 64] = box
+            views.append(view)
+    left1, right1, left2, right2 = views
+    camera = StereoCamera(250.0, 250.0, 160.0, 80.0, 0.4)
+    errors = []
+    for config in (SolverConfig(), SolverConfig(objects=ObjectsConfig(most=0))):
+        state = solve(Frames(left1, right1, left2, right2), config, camera).state[:, 76:112, 128:176]
+        errors.append(np.median(np.linalg.norm(state[3:] - np.reshape((41, -23), (2, 1, 1)), axis=0)))
+    assert errors[0] < 1
+    assert errors[1] > 10

@@ -56,6 +56,15 @@ def test_translations_are_distinct_and_the_most_agreed_on_comes_first() -> None:
     assert len(translations(first, second, PROJECTION, 2.0, 1)) == 1
 
 
+def test_places_propose_where_no_disparity_at_time_2_is_right() -> None:
+    across = twist(np.array([0.9, -0.4, 0, 0, 0, 0]))
+    first, second = moved_points(across, 20)
+    truth = second.copy()
+    second[:, 2] = np.random.default_rng(3).uniform(30, 90, 20)
+    moved = distance(translations(first, second, PROJECTION, 2.0, 1)[0], first, truth)
+    assert np.median(moved) < 1
+
+
 def test_turning_costs_where_points_do_not_tell() -> None:
     """Three points of a small surface, a pixel wrong: without the penalty they are a wild rotation."""
     first, second = moved_points(SHIFT, 3, seed=4)
