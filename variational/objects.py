@@ -31,6 +31,8 @@ FLOW_PX = (2.0, 1.0, 1.0, 1.0)
 """How exactly those of dense inverse search are known, the first time and again."""
 FOLLOWED = 2
 """Proposals that dense inverse search is spent on."""
+PROMISE = 2
+"""A motion that so many more rises like the last would not make better than the state's is given up."""
 ASTRAY_PX = 2.0
 """A surface whose patches are nearer to where its motion leads is not lost."""
 COMPARED = 3000
@@ -135,7 +137,8 @@ def follow(
     rows, columns = (np.flatnonzero(surface.any(axis=axis)) for axis in (1, 0))
     top, left = max(rows[0] - MARGIN, 0), max(columns[0] - MARGIN, 0)
     part = slice(top, rows[-1] + 1 + MARGIN), slice(left, columns[-1] + 1 + MARGIN)
-    middle = np.median(disparity[surface])
+    inside = surface[part]
+    middle = np.median(disparity[part][inside])
     # what lies far before or behind the surface would be torn away from it: moved as if it lay there
     near = np.where(np.abs(disparity[part] - middle) < 0.3 * middle + 5, disparity[part], middle)
     corner = np.eye(4)
@@ -145,7 +148,7 @@ def follow(
     to = np.nan_to_num(np.dstack([x + u, y + v]), nan=-1, posinf=-1, neginf=-1)  # points that come to lie beside the camera
     seen = cv2.remap(left2, to, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     flow = _flow_at_most(np.ascontiguousarray(left1[part]), seen, config.flow_px)
-    points = np.argwhere(surface[part])
+    points = np.argwhere(inside)
     points = points[np.linspace(0, len(points) - 1, min(most_points, len(points))).astype(np.intp)]
     at = (points[:, ::-1] + flow[points[:, 0], points[:, 1]]).astype(np.float32)
     places = cv2.remap(to, at[None], None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[0]
@@ -220,9 +223,12 @@ def _improved(
         if fitted is None:
             break
         better = gain_of(fitted)
-        if better <= gain:
+        rise = better - gain
+        if rise <= 0:
             break
         gain, transform = better, fitted
+        if gain + PROMISE * rise <= 0:
+            break
     return gain, transform
 
 
