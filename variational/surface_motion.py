@@ -30,12 +30,8 @@ def translations(
 
     Parameters
     ----------
-    first, second : np.ndarray
-        (N, 3) float64, (x, y, disparity > 0), pixels.
-    projection : np.ndarray
-        (4, 4), StereoCamera.projection().
-    tolerance_px : float
-        How exactly the points are known.
+    first, second, projection, tolerance_px
+        As for `variational.rigid.fit_motion`.
     most : int
         Translations returned, at most; each moves the surface elsewhere in the image than those before.
 
