@@ -37,6 +37,12 @@ ASTRAY_PX = 2.0
 """A surface whose patches are nearer to where its motion leads is not lost."""
 COMPARED = 3000
 """Pixels of a surface at which the images are compared, at most."""
+EVEN = 0.02
+"""Gradient, an intensity in [0, 1] a pixel, at which dense flow tells half of what there is to tell along it."""
+DOUBT = 0.05
+"""Share of its word that dense flow keeps where and along what it sees nothing."""
+SEES_PX = 9
+"""Side of the patches that dense flow sees, in pixels of its own images."""
 INDEPENDENT_PX = 10
 """How far apart two comparisons have little in common: census words are 9 pixels wide."""
 
@@ -48,15 +54,11 @@ class ObjectsConfig:
     Parameters
     ----------
     most : int
-        Surfaces looked for, the largest; 0 leaves the search out.
+        Surfaces looked for, those with most matched pixels; 0 leaves the search out.
     cost : float
         A pixel is unexplained if its chosen motion costs more than this (variational.fusion), in [0, 1].
     least_px : int
-        Fewest unexplained pixels of a surface.
-    largest : float
-        Share of the image above which a surface is the scene, not an object.
-    matched : float
-        Least share of its pixels that are matched at time 1.
+        Fewest unexplained pixels of a surface that are matched at time 1.
     jump_px : float
         A difference of disparity between neighbours that separates two surfaces.
     places : int
@@ -71,11 +73,9 @@ class ObjectsConfig:
         Settings of the patches.
     """
 
-    most: int = 8
+    most: int = 16
     cost: float = 0.45
-    least_px: int = 150
-    largest: float = 0.1
-    matched: float = 0.2
+    least_px: int = 75
     jump_px: float = 1.5
     places: int = 80
     least_places: int = 5
@@ -87,38 +87,54 @@ class ObjectsConfig:
 def unexplained_surfaces(
     disparity: np.ndarray, cost: np.ndarray, visible: np.ndarray, matched: np.ndarray, config: ObjectsConfig
 ) -> list[np.ndarray]:
-    """Connected surfaces of pixels that no motion explains: (H, W) bool masks, the largest first.
+    """Connected surfaces of pixels that no motion explains: (H, W) bool masks, those with most matched pixels first.
 
-    What has no texture is never explained, but neither is it matched at time 1: such surfaces are left out.
+    What has no texture is never explained, but neither is it matched at time 1: it does not count. Nor does it speak against
+    a surface: a lorry may be plain but for its edges, and nearly as large as the image.
     """
     open_ = ((cost > config.cost) & visible).astype(np.uint8)
     open_ = cv2.morphologyEx(open_, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
     for axis in (0, 1):
         jump = np.abs(np.diff(disparity, axis=axis)) > config.jump_px
         open_[(slice(None),) * axis + (slice(1, None),)][jump] = 0
-    _, labels, statistics, _ = cv2.connectedComponentsWithStats(open_, connectivity=4)
-    areas = statistics[:, cv2.CC_STAT_AREA].copy()
-    compared = np.bincount(labels[matched], minlength=len(areas))
-    areas[(areas > config.largest * labels.size) | (compared < config.matched * areas)] = 0
-    areas[0] = 0
-    order = np.argsort(-areas, kind="stable")[: config.most]
-    return [labels == k for k in order if areas[k] >= config.least_px]
+    count, labels = cv2.connectedComponents(open_, connectivity=4)
+    compared = np.bincount(labels[matched], minlength=count)
+    compared[0] = 0
+    order = np.argsort(-compared, kind="stable")[: config.most]
+    return [labels == k for k in order if compared[k] >= config.least_px]
 
 
-def _flow_at_most(first: np.ndarray, second: np.ndarray, side_px: int) -> np.ndarray:
-    """(H, W, 2) dense inverse search, at a reduced size if the images are larger than such a square."""
+def _flow_at_most(first: np.ndarray, second: np.ndarray, side_px: int) -> tuple[np.ndarray, np.ndarray]:
+    """(H, W, 2) dense inverse search, at a reduced size if the images are larger than such a square; and what it saw.
+
+    That is (H, W, 3): means over its patches of the squares and the product of the second image's derivatives, dx^2, dx dy, dy^2.
+    """
     height, width = first.shape
     factor = max(1.0, np.sqrt(first.size / side_px**2))
     size = max(MARGIN, round(width / factor)), max(MARGIN, round(height / factor))
     small = [cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (first, second)]
-    return cv2.resize(dense_inverse_search(*small), (width, height)) * np.array([width / size[0], height / size[1]], np.float32)
+    flow = cv2.resize(dense_inverse_search(*small), (width, height)) * np.array([width / size[0], height / size[1]], np.float32)
+    dx, dy = (0.5 * cv2.Sobel(small[1], cv2.CV_32F, *order, ksize=1) for order in ((1, 0), (0, 1)))
+    tensor = cv2.blur(np.dstack([dx * dx, dx * dy, dy * dy]), (SEES_PX, SEES_PX))
+    return flow, cv2.resize(tensor, (width, height))
+
+
+def telling_of(tensor: np.ndarray) -> np.ndarray:
+    """(N, 2, 2) symmetric: how much dense flow tells in each direction, from DOUBT to 1, given dx^2, dx dy, dy^2 (N, 3).
+
+    On an even surface it says no more than where it began, and beside an edge no more than how far that went across itself.
+    """
+    values, vectors = np.linalg.eigh(tensor[:, [0, 1, 1, 2]].reshape(-1, 2, 2).astype(np.float64))
+    values = np.maximum(values, 0)
+    told = DOUBT + (1 - DOUBT) * np.sqrt(values / (values + EVEN**2))
+    return (vectors * told[:, None]) @ vectors.transpose(0, 2, 1)
 
 
 def follow(
     left1: np.ndarray, left2: np.ndarray, surface: np.ndarray, disparity: np.ndarray, homography: np.ndarray,
     config: ObjectsConfig, most_points: int = 2500,
-) -> np.ndarray:  # fmt: skip
-    """(N, 4) x, y at time 1 and at time 2 of a surface's pixels, measured by dense flow from where a motion leads.
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Places of a surface's pixels at both times, measured by dense flow from where a motion leads.
 
     Parameters
     ----------
@@ -133,6 +149,13 @@ def follow(
     config : ObjectsConfig
     most_points : int
         Pixels drawn from the surface, evenly.
+
+    Returns
+    -------
+    places : np.ndarray
+        (N, 4) x, y at time 1 and at time 2.
+    telling : np.ndarray
+        (N, 2, 2), see `telling_of`.
     """
     rows, columns = (np.flatnonzero(surface.any(axis=axis)) for axis in (1, 0))
     top, left = max(rows[0] - MARGIN, 0), max(columns[0] - MARGIN, 0)
@@ -147,12 +170,13 @@ def follow(
     y, x = np.indices(near.shape, np.float32)
     to = np.nan_to_num(np.dstack([x + u, y + v]), nan=-1, posinf=-1, neginf=-1)  # points that come to lie beside the camera
     seen = cv2.remap(left2, to, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    flow = _flow_at_most(np.ascontiguousarray(left1[part]), seen, config.flow_px)
+    flow, tensor = _flow_at_most(np.ascontiguousarray(left1[part]), seen, config.flow_px)
     points = np.argwhere(inside)
     points = points[np.linspace(0, len(points) - 1, min(most_points, len(points))).astype(np.intp)]
     at = (points[:, ::-1] + flow[points[:, 0], points[:, 1]]).astype(np.float32)
     places = cv2.remap(to, at[None], None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[0]
-    return np.hstack([points[:, ::-1] + (left, top), places]).astype(np.float64)
+    ends = np.hstack([points[:, ::-1] + (left, top), places]).astype(np.float64)
+    return ends, telling_of(tensor[points[:, 0], points[:, 1]])
 
 
 def searches(
@@ -192,7 +216,7 @@ def searches(
         astray = np.abs(seen[:, 2:] - seen[:, :2] - state[C + 1 :, y, x].T).max(axis=1)
         if len(seen) < config.least_places or np.median(astray) < ASTRAY_PX:
             return None  # a shadow, a highlight: the images disagree, the motion is right
-        first, second = _ends(start, state[D1], seen, matched=False)
+        first, second, _ = _ends(start, state[D1], seen, matched=False)
         proposed = translations(first, second, projection, PATCHES_PX, config.proposals)
         gain_of = _judge(state, surface, words, projection, fusion)
         fitted = (fit_from(each, first, second, projection, PATCHES_PX, translates=True) for each in proposed)
@@ -217,9 +241,9 @@ def _improved(
     """A surface's gain and transform (4, 4), fitted to what dense flow measures from it, as long as the gain rises."""
     left1, _, left2, _ = frames.grey
     for turn, tolerance_px in enumerate(FLOW_PX):
-        followed = follow(left1, left2, surface, disparity, _homography(transform, projection), config)
-        ends = _ends(start, disparity, followed, matched=turn > 0)
-        fitted = fit_from(transform, *ends, projection, tolerance_px, translates=False)
+        followed, telling = follow(left1, left2, surface, disparity, _homography(transform, projection), config)
+        first, second, chosen = _ends(start, disparity, followed, matched=turn > 0)
+        fitted = fit_from(transform, first, second, projection, tolerance_px, translates=False, telling=telling[chosen])
         if fitted is None:
             break
         better = gain_of(fitted)
@@ -256,15 +280,18 @@ def _judge(
 
 def _ends(
     start: Start, disparity: np.ndarray, followed: np.ndarray, matched: bool, most: int = 250
-) -> tuple[np.ndarray, np.ndarray]:
-    """(N, 3) x, y, disparity at both times of points (n, 4), those that are inside; only matched ones at time 2 if asked."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(N, 3) x, y, disparity at both times of points (n, 4), those that are inside, and their indices (N,).
+
+    Only those that are matched at time 2, if asked.
+    """
     size = np.array([disparity.shape[1], disparity.shape[0]] * 2)
     nearest = np.rint(followed)
-    inside = ((nearest >= 0) & (nearest < size)).all(axis=1)
+    inside = np.flatnonzero(((nearest >= 0) & (nearest < size)).all(axis=1))
     followed = followed[inside]
     x1, y1, x2, y2 = nearest[inside].astype(np.intp).T
     first = np.column_stack([followed[:, :2], disparity[y1, x1]])
     second = np.column_stack([followed[:, 2:], start.match2.disparity[y2, x2]])
     usable = np.flatnonzero((first[:, 2] > 0.5) & (second[:, 2] > 0.5) & (start.match2.matched[y2, x2] | (not matched)))
     chosen = usable[np.linspace(0, len(usable) - 1, min(most, len(usable))).astype(np.intp)]
-    return first[chosen], second[chosen]
+    return first[chosen], second[chosen], inside[chosen]

@@ -238,7 +238,7 @@ def twist(step: np.ndarray) -> np.ndarray:
 
 def gauss_newton_step(
     transform: np.ndarray, points: np.ndarray, second: np.ndarray, projection: np.ndarray,
-    weigh: Callable[[np.ndarray], np.ndarray], turning: float = 0.0,
+    weigh: Callable[[np.ndarray], np.ndarray], turning: float = 0.0, telling: np.ndarray | None = None,
 ) -> np.ndarray | None:  # fmt: skip
     """One step of a rigid transform (4, 4) towards less of the weighed squares of the distance in (x, y, disparity).
 
@@ -256,6 +256,8 @@ def gauss_newton_step(
         Residuals (N, 3) to their weights (N, 3).
     turning : float
         Weight of the squared angle of rotation, px^2: where the points do not tell, a motion does not turn.
+    telling : np.ndarray or None
+        (N, 2, 2) symmetric factors of the residuals in (x, y): how much each point's place says, by direction; all if None.
 
     Returns
     -------
@@ -265,12 +267,17 @@ def gauss_newton_step(
     moved = points @ transform[:3, :3].T + transform[:3, 3]
     with np.errstate(divide="ignore", invalid="ignore"):
         residual = projected(moved, projection) - second
+        if telling is not None:
+            residual[:, :2] = np.einsum("nij,nj->ni", telling, residual[:, :2])
         weight = weigh(residual)
         usable = (moved[:, 2] > 0) & np.isfinite(weight).all(axis=1)
     residual, root = residual[usable], np.sqrt(weight[usable])
     if len(root) < 3:
         return None
-    jacobian = (rigid_derivatives(moved[usable], projection) * root.T).reshape(6, -1)
+    jacobian = rigid_derivatives(moved[usable], projection)
+    if telling is not None:
+        jacobian[:, :2] = np.einsum("nij,kjn->kin", telling[usable], jacobian[:, :2])
+    jacobian = (jacobian * root.T).reshape(6, -1)
     normal, gradient = jacobian @ jacobian.T, jacobian @ (residual * root).T.ravel()
     if turning:
         normal[3:, 3:] += turning * np.eye(3)

@@ -61,8 +61,9 @@ def translations(
 
 
 def fit_from(
-    transform: np.ndarray, first: np.ndarray, second: np.ndarray, projection: np.ndarray, tolerance_px: float, translates: bool
-) -> np.ndarray | None:
+    transform: np.ndarray, first: np.ndarray, second: np.ndarray, projection: np.ndarray, tolerance_px: float,
+    translates: bool, telling: np.ndarray | None = None,
+) -> np.ndarray | None:  # fmt: skip
     """The rigid motion near a first one that points follow best.
 
     Parameters
@@ -73,6 +74,8 @@ def fit_from(
         As for `translations`.
     translates : bool
         Whether the first motion knows no rotation yet.
+    telling
+        As for `variational.rigid.gauss_newton_step`.
 
     Returns
     -------
@@ -83,7 +86,7 @@ def fit_from(
     for scale in (COARSE_TO_FINE if translates else ()) + (SCALE,) * STEPS:
         scale_px = scale * tolerance_px
         weigh = partial(_weigh_apart, scale_px=scale_px)
-        step = gauss_newton_step(transform, points, second, projection, weigh, (scale_px / TURN) ** 2)
+        step = gauss_newton_step(transform, points, second, projection, weigh, (scale_px / TURN) ** 2, telling)
         if step is None:
             return None
         transform = step

@@ -10,7 +10,7 @@ from variational.frames import Frames
 from variational.fusion import FusionConfig
 from variational.initialise import Start
 from variational.matching import StereoMatch
-from variational.objects import ObjectsConfig, _judge, follow, searches, unexplained_surfaces
+from variational.objects import DOUBT, EVEN, ObjectsConfig, _judge, follow, searches, telling_of, unexplained_surfaces
 from variational.patches import PatchesConfig
 from variational.rigid import RigidMotion, displacements
 
@@ -65,11 +65,11 @@ def test_surfaces_end_where_the_disparity_jumps():
     cost = np.full((30, 40), 0.1, np.float32)
     cost[5:25, 10:30] = 0.9
     visible = matched = np.ones((30, 40), bool)
-    surfaces = unexplained_surfaces(disparity, cost, visible, matched, ObjectsConfig(least_px=50, largest=0.5))
+    surfaces = unexplained_surfaces(disparity, cost, visible, matched, ObjectsConfig(least_px=50))
     assert len(surfaces) == 2
     assert all(150 < surface.sum() <= 200 for surface in surfaces)
-    assert not unexplained_surfaces(disparity, cost, ~visible, matched, ObjectsConfig(least_px=50, largest=0.5))
-    assert not unexplained_surfaces(disparity, cost, visible, ~matched, ObjectsConfig(least_px=50, largest=0.5))
+    assert not unexplained_surfaces(disparity, cost, ~visible, matched, ObjectsConfig(least_px=50))
+    assert not unexplained_surfaces(disparity, cost, visible, ~matched, ObjectsConfig(least_px=50))
 
 
 @pytest.mark.parametrize("corner", [(60, 50), (-12, 90)])
@@ -78,8 +78,8 @@ def test_dense_flow_measures_what_a_motion_leaves(corner: tuple[int, int]) -> No
     left1, left2, surface = jumping_box(*corner)
     homography = np.eye(4)
     homography[:2, 3] = SHIFT[0] + 2, SHIFT[1] - 1
-    followed = follow(left1, left2, surface, np.full(SHAPE, 12, np.float32), homography, FAR)
-    assert len(followed) == surface.sum()
+    followed, telling = follow(left1, left2, surface, np.full(SHAPE, 12, np.float32), homography, FAR)
+    assert len(followed) == len(telling) == surface.sum()
     assert surface[followed[:, 1].astype(int), followed[:, 0].astype(int)].all()
     moved = followed[:, 2:] - followed[:, :2]
     assert (np.linalg.norm(moved - SHIFT, axis=1) < 0.5).mean() > 0.9
@@ -143,12 +143,31 @@ def test_motions_are_judged_against_the_state() -> None:
     assert _judge(state, inside, words, PROJECTION, FusionConfig())(motion) > 0.4
 
 
-def test_the_scene_is_no_object_and_the_largest_comes_first() -> None:
+def test_what_flow_tells_by_direction() -> None:
+    """An even surface, a vertical edge (dx alone), a corner, and an edge across the diagonal."""
+    steep = 100 * EVEN**2
+    told = telling_of(np.array([[0, 0, 0], [steep, 0, 0], [steep, 0, steep], [steep, steep, steep]], np.float32))
+    np.testing.assert_allclose(told, told.transpose(0, 2, 1))
+    np.testing.assert_allclose(told[0], DOUBT * np.eye(2), atol=1e-6)
+    assert told[1, 0, 0] > 0.99
+    assert abs(told[1, 1, 1] - DOUBT) < 1e-6
+    assert abs(told[1, 0, 1]) < 1e-6
+    np.testing.assert_allclose(told[2], told[1, 0, 0] * np.eye(2), atol=1e-6)
+    across, along = np.array([1, 1]) / np.sqrt(2), np.array([1, -1]) / np.sqrt(2)
+    assert across @ told[3] @ across > 0.99
+    assert abs(along @ told[3] @ along - DOUBT) < 1e-3
+
+
+def test_surfaces_with_most_matches_come_first_however_large_and_plain() -> None:
     cost = np.zeros((60, 80), np.float32)
     cost[:30] = cost[40:50, 5:35] = cost[40:50, 45:65] = 0.9
     everywhere = np.ones(cost.shape, bool)
+    matched = everywhere.copy()
+    matched[:30] = False
     disparity, config = np.full(cost.shape, 5, np.float32), ObjectsConfig(least_px=50)
-    surfaces = unexplained_surfaces(disparity, cost, everywhere, everywhere, config)
+    surfaces = unexplained_surfaces(disparity, cost, everywhere, matched, config)
     assert [surface.sum() for surface in surfaces] == [300, 200]
-    config = ObjectsConfig(least_px=50, most=1)
-    assert len(unexplained_surfaces(disparity, cost, everywhere, everywhere, config)) == 1
+    matched[2:28, 2:12] = True  # a tenth of it
+    surfaces = unexplained_surfaces(disparity, cost, everywhere, matched, config)
+    assert [surface.sum() for surface in surfaces] == [300, 2400, 200]
+    assert len(unexplained_surfaces(disparity, cost, everywhere, matched, ObjectsConfig(least_px=50, most=1))) == 1

@@ -43,6 +43,21 @@ def test_a_few_points_are_enough_among_many_that_are_wrong() -> None:
     assert np.median(distance(fit_from(best, first, second, PROJECTION, 1.0, translates=False), first, truth)) < 0.6
 
 
+def test_places_count_along_the_directions_in_which_they_tell() -> None:
+    """Two thirds lie on level edges and have stayed where they began along x; seen across, up and down, they are right."""
+    first, second = moved_points(SHIFT, 90)
+    truth = second.copy()
+    second[30:, 0] = first[30:, 0]
+    telling = np.repeat(np.eye(2)[None], 90, axis=0)
+    telling[30:, 0, 0] = 0.05
+    fitted = fit_from(np.eye(4), first, second, PROJECTION, 4.0, translates=True, telling=telling)
+    plain = fit_from(np.eye(4), first, second, PROJECTION, 4.0, translates=True)
+    assert fitted is not None
+    assert np.median(distance(fitted, first, truth)) < 0.5
+    assert plain is not None
+    assert np.median(distance(plain, first, truth)) > 3
+
+
 def test_translations_are_distinct_and_the_most_agreed_on_comes_first() -> None:
     first, second = moved_points(SHIFT, 30)
     second[:10] = first[:10] + (40, 5, 0)
