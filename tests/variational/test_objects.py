@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
+from variational import objects
 from variational.camera import StereoCamera
 from variational.census import census
 from variational.frames import Frames
@@ -99,6 +100,22 @@ def test_a_lost_box_gets_its_motion() -> None:
     assert abs(np.median(u) - SHIFT[0]) < 0.5
     assert abs(np.median(v) - SHIFT[1]) < 0.5
     np.testing.assert_array_equal(motion.support, surface)
+
+
+def test_dense_flow_is_fitted_by_what_it_sees(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The patches' places count whole, dense flow's by direction."""
+    left1, left2, surface = jumping_box()
+    frames = Frames(*(image[..., None] for image in (left1, left1, left2, left2)))
+    told, fit = [], objects.fit_from
+
+    def watched(transform, first, *rest, telling=None, **more):  # type: ignore[no-untyped-def]
+        told.append((more["translates"], None if telling is None else telling.shape == (len(first), 2, 2)))
+        return fit(transform, first, *rest, telling=telling, **more)
+
+    monkeypatch.setattr(objects, "fit_from", watched)
+    disparity = np.full(SHAPE, 12, np.float32)
+    found_in(start_with(disparity, np.ones(SHAPE, bool)), standing(disparity), frames, [surface])
+    assert {(True, None), (False, True)} == set(told)
 
 
 @pytest.mark.parametrize("matched", [False, True])

@@ -58,6 +58,23 @@ def test_places_count_along_the_directions_in_which_they_tell() -> None:
     assert np.median(distance(plain, first, truth)) > 3
 
 
+def test_a_place_that_tells_half_weighs_a_quarter() -> None:
+    """Half of the points are off by 4 px along x: the shift that least squares finds, without turning, is 4 * 0.25 / 1.25."""
+    first, _ = moved_points(SHIFT, 60)
+    first[:, 2] = 12
+    second = first.copy()
+    second[::2, 0] += 4
+    telling = np.repeat(np.eye(2)[None], 60, axis=0)
+    telling[::2, 0, 0] = 0.5
+    points, motion = projected(first, np.linalg.inv(PROJECTION)), np.eye(4)
+    for _ in range(5):
+        step = gauss_newton_step(motion, points, second, PROJECTION, np.ones_like, 1e9, telling)
+        assert step is not None
+        motion = step
+    shift = apply_homography(PROJECTION @ motion @ np.linalg.inv(PROJECTION), first) - first
+    np.testing.assert_allclose(shift, np.tile([0.8, 0, 0], (60, 1)), atol=0.06)  # disparity couples a little
+
+
 def test_translations_are_distinct_and_the_most_agreed_on_comes_first() -> None:
     first, second = moved_points(SHIFT, 30)
     second[:10] = first[:10] + (40, 5, 0)
