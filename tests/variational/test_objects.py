@@ -1,5 +1,7 @@
 """Lost objects: found again where they went, and nothing where nothing is seen again."""
 
+from typing import Any
+
 import cv2
 import numpy as np
 import pytest
@@ -108,7 +110,7 @@ def test_dense_flow_is_fitted_by_what_it_sees(monkeypatch: pytest.MonkeyPatch) -
     frames = Frames(*(image[..., None] for image in (left1, left1, left2, left2)))
     told, fit = [], objects.fit_from
 
-    def watched(transform, first, *rest, telling=None, **more):  # type: ignore[no-untyped-def]
+    def watched(transform: np.ndarray, first: np.ndarray, *rest: Any, telling: np.ndarray | None = None, **more: Any) -> Any:
         told.append((more["translates"], None if telling is None else telling.shape == (len(first), 2, 2)))
         return fit(transform, first, *rest, telling=telling, **more)
 
