@@ -4,7 +4,8 @@ Where no candidate motion makes the images agree, although the pixels should be 
 that dense flow could not follow, mostly too far. Patches of each connected surface of such pixels are looked for in left2
 (variational.patches) and propose a few motions. Left2 is then seen through each of them, where little is left to move:
 dense inverse search measures it, a better fit follows, and so on. Of all these motions the surface takes the one under
-which the images agree best, if they agree better than so far by more than chance.
+which the images agree best, if they agree better than so far by more than chance; one that falls short of this by little
+may be a pixel or two beside the truth, and climbs to where they agree better.
 """
 
 from collections.abc import Callable
@@ -21,7 +22,7 @@ from variational.initialise import Start, dense_inverse_search
 from variational.patches import Patches, PatchesConfig
 from variational.rigid import RigidMotion, apply_homography, displacements, thin
 from variational.state import D1, C
-from variational.surface_motion import fit_from, translations
+from variational.surface_motion import climb, fit_from, translations
 
 MARGIN = 16
 """Pixels around a surface that dense inverse search sees too."""
@@ -39,6 +40,10 @@ COMPARED = 3000
 """Pixels of a surface at which the images are compared, at most."""
 EVEN = 0.02
 """Gradient, an intensity in [0, 1] a pixel, at which dense flow tells half of what there is to tell along it."""
+NEARLY = 0.02
+"""A motion whose gain falls short of nothing by less may be a little beside the truth."""
+MOVED = 300
+"""Points of a surface that the steps of its motion are measured at, at most."""
 DOUBT = 0.05
 """Share of its word that dense flow keeps where and along what it sees nothing."""
 SEES_PX = 9
@@ -222,7 +227,9 @@ def searches(
         fitted = (fit_from(each, first, second, projection, PATCHES_PX, translates=True) for each in proposed)
         begun = sorted(((gain_of(each), each) for each in fitted if each is not None), key=itemgetter(0), reverse=True)
         improved = (_improved(*each, start, state[D1], frames, surface, projection, gain_of, config) for each in begun[:FOLLOWED])
-        gain, best = max(improved, key=itemgetter(0), default=(0.0, np.eye(4)))
+        gain, best = max(improved, key=itemgetter(0), default=(-np.inf, np.eye(4)))
+        if 0 >= gain > -NEARLY:
+            gain, best = climb(gain, best, _points(state[D1], surface, MOVED), projection, gain_of)
         return RigidMotion(best, _homography(best, projection), surface) if gain > 0 else None
 
     patches = Patches(frames.left1, frames.left2, config.patches).follow(surfaces, config.places)
@@ -261,11 +268,9 @@ def _judge(
     config: FusionConfig,
 ) -> Callable[[np.ndarray], float]:  # fmt: skip
     """How much better the images agree on a surface under a transform (4, 4) than under the state, less a standard error."""
-    at = thin(surface.ravel(), COMPARED)
-    y, x = np.unravel_index(at, surface.shape)
-    d1, change, u, v = (state[k].ravel()[at] for k in (D1, C, C + 1, C + 2))
-    places, points = np.column_stack([x, y]), np.column_stack([x, y, d1])
-    now = costs_of_ends(places, points + np.column_stack([u, v, change]), words, config)
+    points = _points(state[D1], surface, COMPARED)
+    places = points[:, :2].astype(np.intp)
+    now = costs_of_ends(places, points + state[C:, *places.T[::-1]].T[:, [1, 2, 0]], words, config)
     now[np.isnan(now)] = config.outside_cost
     error = INDEPENDENT_PX / np.sqrt(np.count_nonzero(surface))
 
@@ -276,6 +281,12 @@ def _judge(
         return float(gain.mean() - error * gain.std())
 
     return gain_of
+
+
+def _points(disparity: np.ndarray, surface: np.ndarray, most: int) -> np.ndarray:
+    """(N, 3) x, y, disparity of a surface's pixels, evenly thinned."""
+    y, x = np.unravel_index(thin(surface.ravel(), most), surface.shape)
+    return np.column_stack([x, y, disparity[y, x]])
 
 
 def _ends(

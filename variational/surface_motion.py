@@ -3,13 +3,16 @@
 Three points of a small surface, known to a few pixels, fix a rotation that is mostly noise, and a fit that begins there
 ends there. So fits begin with translations, one from each point, which all points judge; rotation comes in step by step,
 under a penalty that tightens, and a disparity at time 2 that is wrong leaves the point's place its weight.
+
+What correspondences leave, a pixel or two, the images themselves can tell: a motion climbs to where they agree better.
 """
 
+from collections.abc import Callable
 from functools import partial
 
 import numpy as np
 
-from variational.rigid import apply_homography, gauss_newton_step, projected
+from variational.rigid import apply_homography, gauss_newton_step, projected, rigid_derivatives, twist
 
 SPREAD = 2.0
 """A point follows a translation to so many times its tolerance: the surface may turn."""
@@ -21,6 +24,10 @@ SCALE, STEPS = 0.7, 4
 """The last scale, in tolerances, and steps with it."""
 TURN = 0.5
 """Rotation that weighs as much as one point at the penalty's scale, rad."""
+CLIMBS_PX = (2.0, 1.0)
+"""How far the steps of `climb` move the surface: each in turn, to either side of six motions."""
+LARGEST_TURN = 0.05
+"""A step turns the surface no farther, however little that moves it, rad; times its pixels."""
 
 
 def translations(
@@ -97,3 +104,45 @@ def _weigh_apart(residual: np.ndarray, scale_px: float, power: int = 2) -> np.nd
     """(..., 3): Geman-McClure weights of the place, and of the disparity where the place is right."""
     place = 1 / (1 + (residual[..., :2] ** 2).sum(axis=-1) / scale_px**2) ** power
     return np.stack([place, place, place / (1 + residual[..., 2] ** 2 / scale_px**2) ** power], axis=-1)
+
+
+def climb(
+    gain: float, transform: np.ndarray, first: np.ndarray, projection: np.ndarray, gain_of: Callable[[np.ndarray], float]
+) -> tuple[float, np.ndarray]:
+    """A motion nearby that gains more: a coordinate search, whose coordinates move the surface one pixel each.
+
+    Flow of a surface that is plain but for an edge is a pixel or two beside the truth; so little decides whether the images
+    agree. Translations come first, and each further coordinate, rotations at last, is what the ones before it cannot do.
+
+    Parameters
+    ----------
+    gain, transform
+        What it gains; (4, 4).
+    first
+        As for `translations`: points of the surface, at time 1.
+    projection
+        As for `translations`.
+    gain_of : function
+        Of a transform.
+
+    Returns
+    -------
+    tuple of float and np.ndarray
+        The larger gain and its transform; those given, if nothing nearby gains more.
+    """
+    points = projected(first[first[:, 2] > 0], np.linalg.inv(projection))
+    for step_px in CLIMBS_PX:
+        moved = points @ transform[:3, :3].T + transform[:3, 3]
+        moved = moved[moved[:, 2] > 0]
+        if len(moved) < 3:
+            break
+        derivatives = rigid_derivatives(moved, projection).reshape(6, -1)
+        normal = derivatives @ derivatives.T / len(moved)
+        normal[3:, 3:] += np.eye(3) / LARGEST_TURN**2
+        for step in step_px * np.linalg.inv(np.linalg.cholesky(normal)):  # rows: steps under which the mean square is that of one
+            for there in (twist(step) @ transform, twist(-step) @ transform):
+                better = gain_of(there)
+                if better > gain:
+                    gain, transform = better, there
+                    break
+    return gain, transform

@@ -11,10 +11,10 @@ from variational.camera import StereoCamera
 from variational.census import census
 from variational.frames import Frames
 from variational.fusion import FusionConfig
-from variational.initialise import Start
+from variational.initialise import Start, dense_inverse_search
 from variational.matching import StereoMatch
 from variational.objects import DOUBT, EVEN, ObjectsConfig, _judge, follow, searches, telling_of, unexplained_surfaces
-from variational.patches import PatchesConfig
+from variational.patches import Patches, PatchesConfig
 from variational.rigid import RigidMotion, displacements
 
 SHAPE = (120, 200)
@@ -118,6 +118,31 @@ def test_dense_flow_is_fitted_by_what_it_sees(monkeypatch: pytest.MonkeyPatch) -
     disparity = np.full(SHAPE, 12, np.float32)
     found_in(start_with(disparity, np.ones(SHAPE, bool)), standing(disparity), frames, [surface])
     assert {(True, None), (False, True)} == set(told)
+
+
+def test_the_images_tell_what_dense_flow_does_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Patches and flow lead four pixels beside the truth, where the images agree no better than where nothing moves."""
+    left1, left2, surface = jumping_box()
+    frames = Frames(*(image[..., None] for image in (left1, left1, left2, np.roll(left2, -12, axis=1))))
+    truth = np.float32(SHIFT)
+
+    def beside(*images: np.ndarray) -> np.ndarray:
+        return dense_inverse_search(*images) + np.float32([-3, 3])
+
+    def patches(self: Patches, surfaces: list[np.ndarray], most: int) -> list[np.ndarray]:
+        places = np.argwhere(surfaces[0])[::50, ::-1]
+        return [np.hstack([places, places + truth + (-3, 3)])]
+
+    monkeypatch.setattr(objects, "dense_inverse_search", beside)
+    monkeypatch.setattr(Patches, "follow", patches)
+    disparity = np.full(SHAPE, 12, np.float32)
+    start = start_with(disparity, np.ones(SHAPE, bool))
+    monkeypatch.setattr(objects, "NEARLY", 0.0)
+    assert found_in(start, standing(disparity), frames, [surface]) == []
+    monkeypatch.setattr(objects, "NEARLY", 0.1)
+    (motion,) = found_in(start, standing(disparity), frames, [surface])
+    flow = displacements(motion.homography[None], np.zeros((1, *SHAPE), np.int32), disparity)[0][1:, surface]
+    assert np.linalg.norm(flow - truth[:, None], axis=0).mean() < 1.5
 
 
 @pytest.mark.parametrize("matched", [False, True])

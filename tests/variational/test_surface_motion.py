@@ -5,7 +5,7 @@ import pytest
 
 from variational.camera import StereoCamera
 from variational.rigid import apply_homography, gauss_newton_step, projected, twist
-from variational.surface_motion import fit_from, translations
+from variational.surface_motion import CLIMBS_PX, climb, fit_from, translations
 
 PROJECTION = StereoCamera(150.0, 160.0, 90.0, 70.0, 0.5).projection()
 
@@ -114,9 +114,50 @@ def test_turning_costs_where_points_do_not_tell() -> None:
     assert angle(0) > 5 * angle(16.0)
 
 
+def test_a_motion_climbs_to_where_more_is_gained() -> None:
+    """Nearly two pixels off along x, one along y, and turned a little."""
+    first, second = moved_points(MOTION, 60)
+    beside = twist(np.array([0.1, -0.05, 0.02, 0, 0, 0.02])) @ MOTION
+
+    def gain_of(transform: np.ndarray) -> float:
+        return -float(np.mean(np.minimum(distance(transform, first, second), 8)))
+
+    gain, found = climb(gain_of(beside), beside, first, PROJECTION, gain_of)
+    assert gain == gain_of(found)
+    assert gain_of(beside) < -2
+    assert gain > -0.7
+
+
+def test_steps_of_a_climb_move_the_surface_by_their_pixels() -> None:
+    """Translations exactly; further coordinates less, where they would turn it far."""
+    first, second = moved_points(MOTION, 60)
+    tried: list[float] = []
+
+    def gain_of(transform: np.ndarray) -> float:
+        tried.append(float(np.sqrt(np.mean(distance(transform, first, second) ** 2))))
+        return -1.0
+
+    gain, found = climb(0.0, MOTION, first, PROJECTION, gain_of)
+    assert gain == 0
+    np.testing.assert_array_equal(found, MOTION)
+    moved = np.array(tried).reshape(len(CLIMBS_PX), 6, 2) / np.array(CLIMBS_PX)[:, None, None]
+    np.testing.assert_allclose(moved[:, :2], 1, rtol=0.02)
+    assert moved.max() < 1.1
+    assert (moved > 0.1).all()
+
+
+def test_what_lies_nowhere_does_not_climb() -> None:
+    first, _ = moved_points(MOTION, 20)
+    for points, motion in ((first * (1, 1, 0), MOTION), (first, twist(np.array([0, 0, -99.0, 0, 0, 0])))):
+        gain, found = climb(0.5, motion, points, PROJECTION, lambda transform: 1.0)
+        assert gain == 0.5
+        assert found is motion
+
+
 @pytest.mark.parametrize("count", [0, 1, 2])
 def test_too_few_points_fix_no_motion(count: int) -> None:
     first, second = moved_points(MOTION, count)
+    assert climb(0.5, MOTION, first, PROJECTION, lambda transform: 1.0) == (0.5, MOTION)
     assert translations(first, second, PROJECTION, 4.0, 6) == []
     assert fit_from(MOTION, first, second, PROJECTION, 4.0, translates=True) is None
 
@@ -126,5 +167,6 @@ def test_inputs_stay_as_they_are() -> None:
     motion, before = SHIFT.copy(), (SHIFT.copy(), first.copy(), second.copy())
     translations(first, second, PROJECTION, 4.0, 6)
     fit_from(motion, first, second, PROJECTION, 4.0, translates=True)
+    climb(0.0, motion, first, PROJECTION, lambda transform: transform[0, 3])
     for now, then in zip((motion, first, second), before, strict=True):
         np.testing.assert_array_equal(now, then)
