@@ -109,6 +109,36 @@ def unexplained_surfaces(
     return [labels == k for k in order if compared[k] >= config.least_px]
 
 
+def evident(
+    motions: list[RigidMotion], disparity: np.ndarray, words: tuple[np.ndarray, np.ndarray, np.ndarray], fusion: FusionConfig
+) -> list[RigidMotion]:
+    """The camera's motion, and those objects' under which the images agree better where they were found.
+
+    Flow that slips along a repeated pattern (windows of a wall) moves as something rigid does. Where the camera's motion leads
+    out of the image, nothing speaks against it.
+
+    Parameters
+    ----------
+    motions : list of RigidMotion
+        The camera's first.
+    disparity : np.ndarray
+        (H, W) at time 1, pixels.
+    words
+        As for `searches`.
+    fusion : FusionConfig
+        How motions are compared.
+    """
+
+    def gain(motion: RigidMotion) -> float:
+        points = _points(disparity, motion.support, COMPARED)
+        places = points[:, :2].astype(np.intp)
+        ends = (apply_homography(each.homography, points) for each in (motions[0], motion))
+        still, moving = (costs_of_ends(places, each, words, fusion) for each in ends)
+        return float(np.nan_to_num(still - moving).sum())  # NaN: outside of the image, where nothing is compared
+
+    return motions[:1] + [motion for motion in motions[1:] if gain(motion) > 0]
+
+
 def _flow_at_most(first: np.ndarray, second: np.ndarray, side_px: int) -> tuple[np.ndarray, np.ndarray]:
     """(H, W, 2) dense inverse search, at a reduced size if the images are larger than such a square; and what it saw.
 

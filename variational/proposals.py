@@ -19,7 +19,7 @@ from variational.fusion import FusionConfig, choose, motion_costs
 from variational.initialise import Start, sample
 from variational.jit import over_rows, rowwise, side_by_side
 from variational.matching import MatchingConfig, StereoMatch
-from variational.objects import ObjectsConfig, searches, unexplained_surfaces
+from variational.objects import ObjectsConfig, evident, searches, unexplained_surfaces
 from variational.planes import PlanesConfig, plane_disparities
 from variational.rigid import Correspondences, RigidConfig, RigidMotion, displacements, find_motions
 from variational.self_calibration import guess_camera
@@ -191,6 +191,7 @@ def propose(
     words = motion_words(start, frames, matching)
     state = start.state.copy()
     state[D1] = match1.disparity
+    motions = evident(motions, state[D1], words, fusion)
 
     def fuse(objects_near: int) -> tuple[np.ndarray, np.ndarray]:
         """Labels and costs under the motions so far; writes the chosen motion to the state."""

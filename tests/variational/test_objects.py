@@ -13,7 +13,7 @@ from variational.frames import Frames
 from variational.fusion import FusionConfig
 from variational.initialise import Start, dense_inverse_search
 from variational.matching import StereoMatch
-from variational.objects import DOUBT, EVEN, ObjectsConfig, _judge, follow, searches, telling_of, unexplained_surfaces
+from variational.objects import DOUBT, EVEN, ObjectsConfig, _judge, evident, follow, searches, telling_of, unexplained_surfaces
 from variational.patches import Patches, PatchesConfig
 from variational.rigid import RigidMotion, displacements
 
@@ -185,6 +185,28 @@ def test_motions_are_judged_against_the_state() -> None:
     assert 0.35 < gain <= 0.4
     state[3], state[4] = 0, 0
     assert _judge(state, inside, words, PROJECTION, FusionConfig())(motion) > 0.4
+
+
+def moved_by(x: float, y: float, support: np.ndarray) -> RigidMotion:
+    homography = np.eye(4)
+    homography[:2, 3] = x, y
+    return RigidMotion(np.eye(4), homography, support)
+
+
+def test_objects_are_those_that_the_images_show() -> None:
+    """Not what fits worse than the camera's motion, nor what stands where that leads out of the image."""
+    left1, left2, surface = jumping_box()
+    words = census(left1), census(left2), census(np.roll(left2, -12, axis=1))
+    inside = cv2.erode(surface.astype(np.uint8), np.ones((13, 13))).astype(bool)
+    wall = np.zeros(SHAPE, bool)
+    wall[10:30, 20:50] = True
+    nowhere = np.zeros(SHAPE, bool)
+    still, gone = moved_by(0, 0, ~surface), moved_by(500, 0, ~surface)
+    box, slipped, empty = moved_by(*SHIFT, inside), moved_by(9, 4, wall), moved_by(*SHIFT, nowhere)
+    disparity = np.full(SHAPE, 12, np.float32)
+    assert evident([still, slipped, box, empty], disparity, words, FusionConfig()) == [still, box]
+    assert evident([gone, box], disparity, words, FusionConfig()) == [gone]
+    assert evident([still], disparity, words, FusionConfig()) == [still]
 
 
 def test_what_flow_tells_by_direction() -> None:

@@ -1,10 +1,14 @@
 """Which objects are near a pixel, where their motions need an excuse and where not."""
 
 import numpy as np
+import pytest
 
+from tests.variational.scenes import two_layers
+from variational import proposals
 from variational.fusion import FusionConfig
 from variational.proposals import MEASURED, nearby, with_priors
 from variational.rigid import RigidMotion
+from variational.solver import Solution, solve
 
 SHAPE = (60, 100)
 
@@ -36,3 +40,22 @@ def test_an_objects_motion_is_free_where_it_was_found() -> None:
     biased = with_priors(costs, found, config)
     np.testing.assert_array_equal(biased[:, 0], [[0.25, 0.25], [0, 0], [0, 0.125], [0.125, 0.125]])
     assert not costs.any()
+
+
+def test_a_motion_that_the_images_do_not_show_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As if the flow had slipped along the background's upper left."""
+    frames, find = two_layers(96, 144).frames, proposals.find_motions
+
+    def solved(slip: bool) -> Solution:
+        def found(*args: object) -> list[RigidMotion]:
+            motions = find(*args)
+            support = np.zeros(frames.shape, bool)
+            support[5:25, 5:60] = True
+            homography = motions[0].homography.copy()
+            homography[0, 3] += 6
+            return [*motions, RigidMotion(np.eye(4), homography, support)] if slip else motions
+
+        monkeypatch.setattr(proposals, "find_motions", found)
+        return solve(frames)
+
+    np.testing.assert_array_equal(solved(True).state, solved(False).state)
