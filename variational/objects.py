@@ -8,6 +8,7 @@ which the images agree best, if they agree better than so far by more than chanc
 may be a pixel or two beside the truth, and climbs to where they agree better.
 """
 
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
@@ -23,6 +24,8 @@ from variational.patches import Patches, PatchesConfig
 from variational.rigid import RigidMotion, apply_homography, displacements, thin
 from variational.state import D1, C
 from variational.surface_motion import climb, fit_from, translations
+
+logger = logging.getLogger(__name__)
 
 MARGIN = 16
 """Pixels around a surface that dense inverse search sees too."""
@@ -129,14 +132,19 @@ def evident(
         How motions are compared.
     """
 
+    camera, *objects = motions
+
     def gain(motion: RigidMotion) -> float:
         points = _points(disparity, motion.support, COMPARED)
         places = points[:, :2].astype(np.intp)
-        ends = (apply_homography(each.homography, points) for each in (motions[0], motion))
+        ends = (apply_homography(each.homography, points) for each in (camera, motion))
         still, moving = (costs_of_ends(places, each, words, fusion) for each in ends)
         return float(np.nan_to_num(still - moving).sum())  # NaN: outside of the image, where nothing is compared
 
-    return motions[:1] + [motion for motion in motions[1:] if gain(motion) > 0]
+    kept = [motion for motion in objects if gain(motion) > 0]
+    if len(kept) < len(objects):
+        logger.info("%d of %d moving objects dropped: nothing shows that they move", len(objects) - len(kept), len(objects))
+    return [camera, *kept]
 
 
 def _flow_at_most(first: np.ndarray, second: np.ndarray, side_px: int) -> tuple[np.ndarray, np.ndarray]:
