@@ -37,16 +37,16 @@ FOLLOWED = 2
 """Proposals that dense inverse search is spent on."""
 PROMISE = 2
 """A motion that so many more rises like the last would not make better than the state's is given up."""
+NEARLY = 0.02
+"""A motion whose gain falls short of nothing by less may be a little beside the truth."""
+MOVED = 300
+"""Points of a surface that the steps of its motion are measured at, at most."""
 ASTRAY_PX = 2.0
 """A surface whose patches are nearer to where its motion leads is not lost."""
 COMPARED = 3000
 """Pixels of a surface at which the images are compared, at most."""
 EVEN = 0.02
 """Gradient, an intensity in [0, 1] a pixel, at which dense flow tells half of what there is to tell along it."""
-NEARLY = 0.02
-"""A motion whose gain falls short of nothing by less may be a little beside the truth."""
-MOVED = 300
-"""Points of a surface that the steps of its motion are measured at, at most."""
 DOUBT = 0.05
 """Share of its word that dense flow keeps where and along what it sees nothing."""
 SEES_PX = 9
@@ -130,8 +130,12 @@ def evident(
         As for `searches`.
     fusion : FusionConfig
         How motions are compared.
-    """
 
+    Returns
+    -------
+    list of RigidMotion
+        In their order; those left out are told in the log.
+    """
     camera, *objects = motions
 
     def gain(motion: RigidMotion) -> float:
@@ -308,7 +312,9 @@ def _judge(
     """How much better the images agree on a surface under a transform (4, 4) than under the state, less a standard error."""
     points = _points(state[D1], surface, COMPARED)
     places = points[:, :2].astype(np.intp)
-    now = costs_of_ends(places, points + state[C:, *places.T[::-1]].T[:, [1, 2, 0]], words, config)
+    x, y = places.T
+    change, u, v = state[C:, y, x]
+    now = costs_of_ends(places, points + np.column_stack([u, v, change]), words, config)
     now[np.isnan(now)] = config.outside_cost
     error = INDEPENDENT_PX / np.sqrt(np.count_nonzero(surface))
 

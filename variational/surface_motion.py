@@ -139,7 +139,11 @@ def climb(
         derivatives = rigid_derivatives(moved, projection).reshape(6, -1)
         normal = derivatives @ derivatives.T / len(moved)
         normal[3:, 3:] += np.eye(3) / LARGEST_TURN**2
-        for step in step_px * np.linalg.inv(np.linalg.cholesky(normal)):  # rows: steps under which the mean square is that of one
+        try:
+            steps = step_px * np.linalg.inv(np.linalg.cholesky(normal))  # rows: each moves the points by a mean square of one
+        except np.linalg.LinAlgError:
+            break  # a point in the camera: nothing tells six coordinates apart
+        for step in steps:
             for there in (twist(step) @ transform, twist(-step) @ transform):
                 better = gain_of(there)
                 if better > gain:

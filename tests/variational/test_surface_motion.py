@@ -154,6 +154,16 @@ def test_what_lies_nowhere_does_not_climb() -> None:
         assert found is motion
 
 
+def test_a_point_in_the_camera_does_not_fix_how_to_climb() -> None:
+    """Its derivatives are so much larger than all others' that six coordinates are not told apart."""
+    first, _ = moved_points(MOTION, 20)
+    nearest = projected(first, np.linalg.inv(PROJECTION))[:, 2].min()
+    into = twist(np.array([0, 0, 1e-8 - nearest, 0, 0, 0]))
+    gain, found = climb(0.5, into, first, PROJECTION, lambda transform: 1.0)
+    assert gain == 0.5
+    assert found is into
+
+
 @pytest.mark.parametrize("count", [0, 1, 2])
 def test_too_few_points_fix_no_motion(count: int) -> None:
     first, second = moved_points(MOTION, count)
