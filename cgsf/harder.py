@@ -1,8 +1,9 @@
 """Samples made harder: what was easy to estimate becomes difficult where the truth is known.
 
 A method is surest where its work was easy, so what it says there teaches nothing about telling right from wrong. In a
-variant of the same images with pieces pasted in front (which hide and move on their own), texture taken away and the
-borders moved inwards (behind which things leave), the truth of the easy original is still the truth.
+variant of the same images with pieces pasted in front (which hide and move on their own), texture taken away, reflections
+in panes, exposed for too long or too short a time and with the borders moved inwards (behind which things leave), the truth
+of the easy original is still the truth.
 
 Related: the pasted, randomly moving pieces of Dosovitskiy et al., FlowNet, ICCV 2015 (FlyingChairs).
 """
@@ -19,12 +20,14 @@ import numpy as np
 from cgsf.datasets import Dataset, Sample, Truth
 from cgsf.errors import InputError
 
-_PIECES, _FLAT_PLACES = (1, 4), (1, 3)  # numbers of, least and most
-_PIECE_SIDE, _FLAT_SIDE = (0.08, 0.35), (0.15, 0.45)  # share of the image's height
+_PIECES, _FLAT_PLACES, _PANES = (1, 4), (1, 3), (0, 2)  # numbers of, least and most
+_PIECE_SIDE, _FLAT_SIDE, _PANE_SIDE = (0.08, 0.35), (0.15, 0.45), (0.05, 0.25)  # share of the image's height
 _IN_FRONT_PX = (2.0, 30.0)  # disparity more than what lies behind
+_BEHIND_PX, _MIRRORED = (2.0, 30.0), (0.3, 0.9)  # disparity less than the pane's; share of the light that is a reflection
 _OWN_MOTION_PX = 15.0  # standard deviation
 _CHANGE = 0.08  # largest change of a piece's disparity, relative
 _FLAT_BLUR_PX = 8.0
+_MISEXPOSED, _LIGHT = 0.5, (0.2, 2.5)  # share of the variants; least and largest factor on their light
 _NOISE, _GAIN = 0.012, 0.05  # largest
 
 
@@ -87,10 +90,13 @@ def _harder(sample: Sample, size: tuple[int, int], rng: np.random.Generator) -> 
     views = _Views(sample, size, rng)
     for _ in range(rng.integers(_FLAT_PLACES[0], _FLAT_PLACES[1] + 1)):
         _flatten(views, rng)
+    for _ in range(rng.integers(_PANES[0], _PANES[1] + 1)):
+        _reflect(views, rng)
     for _ in range(rng.integers(_PIECES[0], _PIECES[1] + 1)):
         _paste(views, rng)
+    light = np.exp(rng.uniform(*np.log(_LIGHT))) if rng.random() < _MISEXPOSED else 1.0
     for i, image in enumerate(views.images):
-        gain = 1 + _GAIN * rng.uniform(-1, 1)
+        gain = light * (1 + _GAIN * rng.uniform(-1, 1))
         noise = rng.uniform(0, _NOISE) * rng.standard_normal(image.shape)
         views.images[i] = np.clip(gain * image + noise, 0, 1).astype(np.float32)
     truth = Truth(views.d1, views.d2, views.flow, disparity_left2=views.d_left2)
@@ -112,6 +118,26 @@ def _flatten(views: _Views, rng: np.random.Generator) -> None:
         views.images[i] += share * (smooth - views.images[i])
 
 
+def _reflect(views: _Views, rng: np.random.Generator) -> None:
+    """Let a rectangle of a surface mirror something: what is seen lies behind it and moves on its own, and is not there."""
+    shape = views.d1.shape
+    pane = np.zeros(shape, np.float32)
+    height, width = (max(4, round(shape[0] * rng.uniform(*_PANE_SIDE))) for _ in range(2))
+    top, left = int(rng.integers(max(1, shape[0] - height))), int(rng.integers(max(1, shape[1] - width)))
+    pane[top : top + height, left : left + width] = rng.uniform(*_MIRRORED)
+    typical = views.typical(pane > 0)
+    if typical is None:
+        return
+    d, change, u, v = typical
+    behind = max(0.0, d - rng.uniform(*_BEHIND_PX))
+    own = u + _OWN_MOTION_PX * rng.standard_normal(), v + _OWN_MOTION_PX * rng.standard_normal()
+    mirrored = _elsewhere(views, rng)
+    surface = _shifts(d, d + change, u, v)
+    for i, seen in enumerate(_shifts(behind, behind + change, *own)):
+        share = _shifted(pane, *surface[i])[..., None]
+        views.images[i] += share * (_shifted(mirrored, *seen).reshape(mirrored.shape) - views.images[i])
+
+
 def _paste(views: _Views, rng: np.random.Generator) -> None:
     """Put an oval piece of the sample's own left1 in front of everything else, at one disparity, moving on its own."""
     shape = views.d1.shape
@@ -123,16 +149,22 @@ def _paste(views: _Views, rng: np.random.Generator) -> None:
     d += rng.uniform(*_IN_FRONT_PX)
     d2 = d * (1 + _CHANGE * rng.uniform(-1, 1))
     u, v = u + _OWN_MOTION_PX * rng.standard_normal(), v + _OWN_MOTION_PX * rng.standard_normal()
-    top, left = (int(rng.integers(full - part + 1)) for full, part in zip(views.whole.shape, shape, strict=False))
-    texture = views.whole[top : top + shape[0], left : left + shape[1]][:, ::-1].copy() * rng.uniform(0.7, 1.3)
+    texture = np.clip(_elsewhere(views, rng), 0, 1)
     alphas = []
     for i, (x, y) in enumerate(_shifts(d, d2, u, v)):
         alphas.append(_shifted(mask, x, y))
-        piece = _shifted(texture, x, y).reshape(texture.shape)
-        views.images[i] += alphas[i][..., None] * (np.clip(piece, 0, 1) - views.images[i])
+        views.images[i] += alphas[i][..., None] * (_shifted(texture, x, y).reshape(texture.shape) - views.images[i])
     here, there = alphas[0] > 0.5, alphas[2] > 0.5
     views.d1[here], views.d2[here], views.flow[here] = d, d2, (u, v)
     views.d_left2[there] = d2
+
+
+def _elsewhere(views: _Views, rng: np.random.Generator) -> np.ndarray:
+    """Another window of the sample's own left1, mirrored, darker or brighter."""
+    parts = zip(views.whole.shape, views.d1.shape, strict=False)
+    top, left = (int(rng.integers(full - part + 1)) for full, part in parts)
+    window = views.whole[top : top + views.d1.shape[0], left : left + views.d1.shape[1]]
+    return window[:, ::-1] * rng.uniform(0.7, 1.3)
 
 
 def _shifts(d1: float, d2: float, u: float, v: float) -> Sequence[tuple[float, float]]:

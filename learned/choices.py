@@ -42,6 +42,8 @@ class Choices(NamedTuple):
     """(B, CHOICES, 5, H, W), pixels, the state itself first; D2, which lives on left2's grid, is the state's in all."""
     sources: Tensor
     """(B, CHOICES - 1, H, W) int64: the pixels that the others come from, as indices into the flat image."""
+    step: Tensor
+    """(B, H, W): largest difference of disparity between two neighbours close by; small on a slope, however far it reaches."""
 
     @property
     def jump(self) -> Tensor:
@@ -56,7 +58,17 @@ def find_choices(state: Tensor) -> Choices:
     for source in sources.split(1, 1):
         there = _take(state, source)
         states.append(torch.cat([there[:, :1], state[:, 1:2], there[:, 2:]], 1))
-    return Choices(torch.stack(states, 1), sources)
+    return Choices(torch.stack(states, 1), sources, _largest_step(state[:, 0]))
+
+
+def _largest_step(disparity: Tensor) -> Tensor:
+    """(B, H, W): between neighbours along rows or columns, both within reach."""
+    side = 2 * _CLOSE_PX + 1
+    steps = [F.max_pool2d(disparity.diff(dim=-1).abs()[:, None], (1, side - 1), 1, (0, _CLOSE_PX)),
+             F.max_pool2d(disparity.diff(dim=-2).abs()[:, None], (side - 1, 1), 1, (_CLOSE_PX, 0))]  # fmt: skip
+    across = F.max_pool2d(steps[0], (side, 1), 1, (_CLOSE_PX, 0))
+    down = F.max_pool2d(steps[1], (1, side), 1, (0, _CLOSE_PX))
+    return torch.maximum(across, down)[:, 0]
 
 
 def _sources(state: Tensor) -> Tensor:

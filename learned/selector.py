@@ -31,7 +31,7 @@ class SelectorConfig:
     layers: tuple[tuple[int, int], ...] = ((32, 1), (32, 2), (32, 4), (32, 8), (32, 1))
     """(channels, dilation) of the hidden 3 x 3 convolutions."""
     least_jump_px: float = 1.0
-    """Where nothing within reach differs by more in disparity, all stays as it is."""
+    """Where no two neighbours within reach differ by more in disparity, all stays as it is: a slope leaves no choice."""
     sure: float = 0.7
     """Probability from which another choice than the state is taken, at test time."""
     steps: int = 2
@@ -93,7 +93,7 @@ class Selector(nn.Module):
         """
         logits, choices = self.weigh(view.state, batch)
         probability, other = logits.softmax(1)[:, 1:].max(1)
-        changes = (probability > self.config.sure) & (choices.jump > self.config.least_jump_px)
+        changes = (probability > self.config.sure) & (choices.step > self.config.least_jump_px)
         chosen = torch.where(changes, other + 1, 0)
         best = choices.states.gather(1, chosen[:, None, None].expand(-1, 1, view.state.shape[1], -1, -1))[:, 0]
         return Update(best - view.state, None)
@@ -143,6 +143,6 @@ def selection_loss(logits: Tensor, choices: Choices, truth: Tensor, least_jump_p
     """
     whole, disparity = right(choices.states, truth)
     good = torch.where(whole.any(1, keepdim=True), whole, disparity)
-    counts = (truth[:, 0] > 0) & good.any(1) & ~good.all(1) & (choices.jump > least_jump_px)
+    counts = (truth[:, 0] > 0) & good.any(1) & ~good.all(1) & (choices.step > least_jump_px)
     probability = logits.log_softmax(1).masked_fill(~good, _NEVER).logsumexp(1)
     return -torch.where(counts, probability, 0).sum() / counts.sum().clamp(min=1)

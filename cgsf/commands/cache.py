@@ -42,7 +42,7 @@ def samples(
     """Cache samples: rendered ones (--family), or those of a data set (--dataset and --root).
 
     A data set's larger images are cut to the size around their centre; harder variants (pieces pasted in front, texture
-    taken away) somewhere.
+    taken away, reflections, too dark or too bright) somewhere.
     """
     from cgsf.datasets import Dataset, open_dataset
     from cgsf.harder import Harder

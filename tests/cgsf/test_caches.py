@@ -51,6 +51,27 @@ def frames(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
+class Known:
+    """Samples of which everything is known."""
+
+    def __init__(self, *samples: Sample) -> None:
+        self.samples, self.names = samples, [sample.name for sample in samples]
+
+    def __len__(self) -> int:
+        return len(self.samples)
+
+    def __getitem__(self, index: int) -> Sample:
+        return self.samples[index]
+
+
+def known_plane(name: str, seed: int = 0) -> Sample:
+    """Of 70 x 100 pixels."""
+    images = [image.astype(np.float32) / 255 for image in scenes.plane(np.random.default_rng(seed), 70, 100)]
+    d1, d2 = (np.full((70, 100), value, np.float32) for value in (8, 10))
+    flow = np.ones((70, 100, 2), np.float32) * scenes.FLOW
+    return Sample(name, *images, truth=Truth(d1, d2, flow, disparity_left2=d2))
+
+
 def test_rendered_samples_by_turns(tmp_path: Path):
     arguments = ("samples", "-o", tmp_path / "c", "--family", "things", "--family", "street", "--size", "48x64", "--seed", 7)
     assert call(*arguments, "--count", 3).exit_code == 0
@@ -97,22 +118,9 @@ def test_what_a_method_is_surest_of_stands_for_the_truth(tmp_path: Path, frames:
     assert np.abs(np.nanmedian(back[:3], (1, 2)) - (10, 8, -2)).max() < 0.5
 
 
-def test_harder_variants_keep_what_is_true(frames: Path, tmp_path: Path):
+def test_harder_variants_keep_what_is_true():
     """Where the truth is known, it leads from image to image, pasted pieces included; nothing else is harder than asked."""
-    flow = np.ones((70, 100, 2), np.float32) * scenes.FLOW
-    maps = [np.full((70, 100), value, np.float32) for value in (8, 10)]
-
-    class Known:
-        names = ("one", "two")
-
-        def __len__(self) -> int:
-            return 2
-
-        def __getitem__(self, index: int) -> Sample:
-            images = [image.astype(np.float32) / 255 for image in scenes.plane(np.random.default_rng(index), 70, 100)]
-            return Sample(self.names[index], *images, truth=Truth(maps[0], maps[1], flow, disparity_left2=maps[1]))
-
-    harder = Harder(Known(), 3, (48, 64))
+    harder = Harder(Known(known_plane("one", 0), known_plane("two", 1)), 3, (48, 64))
     assert harder.names[3:5] == ["two-harder0", "two-harder1"]
     looked_at = 0
     for index in range(6):
@@ -130,7 +138,53 @@ def test_harder_variants_keep_what_is_true(frames: Path, tmp_path: Path):
                 assert np.median(np.abs(there - sample.left1)[pieces]) < 0.06
     assert looked_at >= 6
     with pytest.raises(InputError, match="do not fill"):
-        Harder(Known(), 1, (80, 64))[0]
+        Harder(Known(known_plane("one")), 1, (80, 64))[0]
+
+
+def test_half_of_the_harder_variants_are_exposed_wrongly():
+    """All four images alike, and as far as white, where no truth is lost."""
+    ramp = np.tile(np.linspace(0, 0.6, 64, dtype=np.float32)[:, None], (48, 1, 3))
+    images = [ramp.copy() for _ in range(4)]
+    zeros = np.zeros((48, 64), np.float32)
+    truth = Truth(zeros, zeros, np.zeros((48, 64, 2), np.float32), disparity_left2=zeros)
+    harder = Harder(Known(Sample("ramp", *images, truth=truth)), 60, (48, 64))
+    light = np.array([[np.median(image[:, 32]) / ramp[0, 32, 0] for image in harder[k].images] for k in range(60)])
+    assert 0.3 < (np.abs(light[:, 0] - 1) > 0.1).mean() < 0.6  # a few by less than that
+    assert light.min() < 0.4
+    assert light.max() > 1.6
+    np.testing.assert_allclose(np.median(light / light[:, :1], axis=0), 1, atol=0.03)
+    white = np.array([(harder[k].left1 == 1).all(-1).mean() for k in range(60)])
+    assert (white[light[:, 0] > 1.9] > 0.1).all()
+    assert (white[light[:, 0] < 1.2] < 0.01).all()
+    assert all((image == ramp).all() for image in images)
+
+
+def test_a_pane_is_where_the_truth_says_and_what_it_shows_is_not(monkeypatch: pytest.MonkeyPatch):
+    for name in ("_PANES", "_PIECES", "_FLAT_PLACES"):
+        monkeypatch.setattr(f"cgsf.harder.{name}", (0, 0))
+    for name in ("_MISEXPOSED", "_NOISE", "_GAIN"):
+        monkeypatch.setattr(f"cgsf.harder.{name}", 0)
+    harder = Harder(Known(known_plane("plane")), 40, (66, 96))
+    plain = [harder[k] for k in range(40)]
+    monkeypatch.setattr("cgsf.harder._PANES", (1, 1))
+    (u, v), d1, d2 = scenes.FLOW, 8, 10
+    looked_at = 0
+    for before, sample in zip(plain, harder, strict=False):
+        changed = [np.abs(now - then).sum(-1) > 1e-4 for now, then in zip(sample.images, before.images, strict=True)]
+        x, y, width, height = cv2.boundingRect(changed[0].astype(np.uint8))
+        if not (30 < x < 66 - width and 10 < y < 56 - height):  # in view of all images, its reflection too
+            continue
+        looked_at += 1
+        for mask, (right, down) in zip(changed, ((0, 0), (-d1, 0), (u, v), (u - d2, v)), strict=True):
+            there = cv2.boundingRect(mask.astype(np.uint8))
+            np.testing.assert_allclose(there, (x + right, y + down, width, height), atol=1)
+        inside = np.s_[y + 1 : y + height - 1, x + 1 : x + width - 1]
+        unlike, unlike_before = (np.abs(each.left1 - np.roll(each.right1, d1, 1))[inside].mean() for each in (sample, before))
+        assert unlike > 3 * unlike_before + 0.01
+        assert (sample.truth.disparity1 == d1).all()
+        assert (sample.truth.disparity2 == d2).all()
+        assert (sample.truth.flow == scenes.FLOW).all()
+    assert looked_at >= 2
 
 
 def test_harder_variants_from_the_command_line(tmp_path: Path, frames: Path):

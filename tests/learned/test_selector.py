@@ -50,6 +50,8 @@ def test_choices_are_whole_states_of_the_farthest_and_nearest_pixels(state):
             there = flat[b, :, choices.sources[b, k - 1, y, x]]
             expected = torch.stack([there[0], state[b, 1, y, x], *there[2:]])
             torch.testing.assert_close(choices.states[b, k, :, y, x], expected, rtol=0, atol=0)
+        columns_differ, rows_differ = around.diff(dim=1).abs(), around.diff(dim=0).abs()
+        assert choices.step[b, y, x] == max(columns_differ.max(), rows_differ.max())
     assert (choices.jump >= 0).all()
 
 
@@ -152,12 +154,33 @@ def test_what_it_is_sure_of_is_taken_where_there_is_a_jump(batch):
         selector.logits.bias.copy_(torch.tensor([0.0, 0, 4]))
     changed = batch.start + selector(View(batch.start), batch).change
     choices = find_choices(batch.start)
-    jumps = (choices.jump > 1)[:, None].expand_as(changed)
+    jumps = (choices.step > 1)[:, None].expand_as(changed)
     torch.testing.assert_close(changed[jumps], choices.states[:, 2][jumps])
     torch.testing.assert_close(changed[~jumps], batch.start[~jumps], rtol=0, atol=0)
     unsure = Selector(dataclasses.replace(SMALL, sure=0.98))
     unsure.load_state_dict(selector.state_dict())
     assert unsure(View(batch.start), batch).change.abs().max() == 0
+
+
+@pytest.mark.parametrize("slope", [(0.9, 0.0), (0.0, 0.9), (0.6, -0.6)])
+def test_a_slope_leaves_no_choice(batch, slope):
+    state = batch.start.clone()
+    state[:, 0] = 40 + slope[0] * torch.arange(HEIGHT)[:, None] + slope[1] * torch.arange(WIDTH)
+    selector = Selector(SMALL)
+    with torch.no_grad():
+        selector.logits.bias.copy_(torch.tensor([0.0, 4, 0]))
+    assert selector(View(state), batch).change.abs().max() == 0
+    truth = state + torch.tensor([6.0, 0, 0, 0, 0])[:, None, None]
+    logits, choices = selector.weigh(state, batch)
+    whole, _ = right(choices.states, truth)
+    assert whole.any()
+    assert not whole[:, 0].any()
+    assert selection_loss(logits, choices, truth, 1.0) == 0
+    state[:, 0, 20:] += 0.3 + 1  # a step, and more than one together with the slope
+    changed = selector(View(state), batch).change[:, 0] != 0
+    assert changed[:, 16:24, 1:-1].all()  # at the ends the farthest thing may be the pixel itself
+    assert not changed[:, :16].any()
+    assert not changed[:, 24:].any()
 
 
 def test_right_by_kittis_limits_and_unknown_is_no_error():
@@ -180,7 +203,7 @@ def test_loss_is_the_probability_of_what_is_right(state):
     logits = torch.zeros(2, CHOICES, HEIGHT, WIDTH, requires_grad=True)
     loss = selection_loss(logits, choices, truth, 1.0)
     whole, _ = right(choices.states, truth)
-    counts = whole.any(1) & ~whole.all(1) & (choices.jump > 1) & torch.isfinite(truth[:, 0])
+    counts = whole.any(1) & ~whole.all(1) & (choices.step > 1) & torch.isfinite(truth[:, 0])
     expected = -(whole.sum(1)[counts] / CHOICES).log().mean()
     torch.testing.assert_close(loss, expected)
     loss.backward()
