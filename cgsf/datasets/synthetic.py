@@ -6,8 +6,11 @@ each family, seeds 1,000,000 to 1,000,019, `street` at 376 x 1242 and `things` a
 photographs, default options.
 """
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from cgsf.datasets.sample import Sample
 from cgsf.errors import InputError
@@ -30,6 +33,8 @@ class Synthetic:
         Image size in pixels.
     frames : int
         Length of each scene's video; it gives one sample less, of two frames that follow each other.
+    sky : bool
+        False: the truth of the sky (disparity 0) counts as unknown, as it is in real frames.
     **options
         Fields of `RenderConfig`.
     """
@@ -43,16 +48,19 @@ class Synthetic:
         height: int = 376,
         width: int = 1242,
         frames: int = 2,
+        sky: bool = True,
         **options: Any,
     ) -> None:
         whole = {"count": count, "seed": seed, "height": height, "width": width, "frames": frames}
         for name, value in whole.items():
             if not isinstance(value, int):
                 raise InputError(f"{name} must be a whole number, got {value!r}")
+        if not isinstance(sky, bool):
+            raise InputError(f"sky must be true or false, got {sky!r}")
         if count < 1 or frames < 2:
             raise InputError(f"count must be at least 1 and frames at least 2, got {count} and {frames}")
         self.family, self.seeds, self.size, self.options = family, range(seed, seed + count), (height, width), options
-        self.frames = frames
+        self.frames, self.sky = frames, sky
         scenes = [f"{family}-{number:06d}" for number in self.seeds]
         self.names = scenes if frames == 2 else [f"{name}/{frame:03d}" for name in scenes for frame in range(frames - 1)]
         self._video: tuple[int, list[Sample]] | None = None
@@ -61,12 +69,28 @@ class Synthetic:
         return len(self.names)
 
     def __getitem__(self, index: int) -> Sample:
+        sample = self._render(index)
+        return sample if self.sky else _without_sky(sample)
+
+    def _render(self, index: int) -> Sample:
         scene, frame = divmod(range(len(self))[index], self.frames - 1)
         if self.frames == 2:
             return make_sample(self.family, self.seeds[scene], *self.size, **self.options)
         if self._video is None or self._video[0] != scene:  # a video is rendered as a whole
             self._video = scene, make_video(self.family, self.seeds[scene], *self.size, self.frames, **self.options)
         return self._video[1][frame]
+
+
+def _without_sky(sample: Sample) -> Sample:
+    """Its truth unknown where the disparity is 0."""
+    truth = sample.truth
+    assert truth is not None
+    assert truth.disparity1 is not None
+    sky = truth.disparity1 <= 0
+    known = {name: getattr(truth, name).copy() for name in ("disparity1", "disparity2", "flow")}
+    for each in known.values():
+        each[sky] = np.nan
+    return replace(sample, truth=replace(truth, **known))
 
 
 class Street(Synthetic):

@@ -137,7 +137,22 @@ def test_check_dataset_takes_the_options_of_rendered_samples() -> None:
     good = run(main, ["check-dataset", "synthetic-street", ".", "--option", "count=2", *size])
     assert good.exit_code == 0, good.output
     assert "2 samples checked, 0 suspect" in good.output
-    for option, message in (("count=two", "count must be a whole number"), ("gloss=high", "gloss must be a number")):
+    wrong = {"count=two": "count must be a whole number", "gloss=high": "gloss must be a number", "sky=7": "sky must be true or"}
+    for option, message in wrong.items():
         refused = run(main, ["check-dataset", "synthetic-street", ".", *size, "--option", "count=1", "--option", option])
         assert refused.exit_code == 2
         assert message in refused.output
+
+
+@pytest.mark.parametrize("frames", [2, 3])
+def test_the_sky_may_be_unknown_as_in_real_frames(frames: int) -> None:
+    options = {"count": 1, "seed": 3, "height": 64, "width": 200, "frames": frames}
+    whole, without = (open_dataset("synthetic-street", ".", **options, sky=sky) for sky in (True, False))
+    for known, real in zip(whole, without, strict=True):
+        sky = known.truth.disparity1 == 0
+        assert 0 < sky.mean() < 1
+        for name in ("disparity1", "disparity2", "flow"):
+            before, after = getattr(known.truth, name), getattr(real.truth, name)
+            assert np.isnan(after[sky]).all()
+            np.testing.assert_array_equal(after[~sky], before[~sky])
+        np.testing.assert_array_equal(real.images, known.images)
