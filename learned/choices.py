@@ -8,7 +8,7 @@ which side are the pixels of the same colour?
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -64,11 +64,25 @@ def find_choices(state: Tensor) -> Choices:
 def _largest_step(disparity: Tensor) -> Tensor:
     """(B, H, W): between neighbours along rows or columns, both within reach."""
     side = 2 * _CLOSE_PX + 1
-    steps = [F.max_pool2d(disparity.diff(dim=-1).abs()[:, None], (1, side - 1), 1, (0, _CLOSE_PX)),
-             F.max_pool2d(disparity.diff(dim=-2).abs()[:, None], (side - 1, 1), 1, (_CLOSE_PX, 0))]  # fmt: skip
-    across = F.max_pool2d(steps[0], (side, 1), 1, (_CLOSE_PX, 0))
-    down = F.max_pool2d(steps[1], (1, side), 1, (0, _CLOSE_PX))
-    return torch.maximum(across, down)[:, 0]
+    across, down = disparity.diff(dim=-1).abs(), disparity.diff(dim=-2).abs()
+    across = _largest_around(_largest_around(across, side - 1, -1), side, -2)
+    down = _largest_around(_largest_around(down, side - 1, -2), side, -1)
+    return torch.maximum(across, down)
+
+
+def _largest_around(values: Tensor, count: int, axis: Literal[-2, -1]) -> Tensor:
+    """The largest of `count` values along an axis, none of them below 0, up to `_CLOSE_PX` before and behind.
+
+    Of twice as many with each pass: pooling takes forty times as long.
+    """
+    values = F.pad(values, (_CLOSE_PX,) * 2 if axis == -1 else (0, 0, _CLOSE_PX, _CLOSE_PX))
+    covered = 1
+    while covered < count:
+        shift = min(covered, count - covered)
+        left = values.shape[axis] - shift
+        values = torch.maximum(values.narrow(axis, 0, left), values.narrow(axis, shift, left))
+        covered += shift
+    return values
 
 
 def _sources(state: Tensor) -> Tensor:
