@@ -28,13 +28,13 @@ _FIRST_BIAS = 2.0  # for the state as it is, before training
 class SelectorConfig:
     """Sizes of a selector."""
 
-    layers: tuple[tuple[int, int], ...] = ((32, 1), (32, 2), (32, 4), (32, 8), (32, 1))
+    layers: tuple[tuple[int, int], ...] = ((32, 1), (32, 2), (32, 4), (32, 8), (32, 16), (32, 32), (32, 4), (32, 1))
     """(channels, dilation) of the hidden 3 x 3 convolutions."""
     least_jump_px: float = 1.0
     """Where no two neighbours within reach differ by more in disparity, all stays as it is: a slope leaves no choice."""
     sure: float = 0.7
     """Probability from which another choice than the state is taken, at test time."""
-    steps: int = 2
+    steps: int = 4
     """T: how often it chooses; each time values may come from 4 px farther away."""
 
     def __post_init__(self) -> None:

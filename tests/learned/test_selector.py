@@ -142,7 +142,7 @@ def test_votes_equal_their_plain_twin(batch):
 
 def test_untrained_it_changes_nothing_and_needs_evidence(batch):
     states = refine(Selector(SMALL), batch).states
-    assert len(states) == 3
+    assert len(states) == 1 + SMALL.steps
     torch.testing.assert_close(states[-1], batch.start, rtol=0, atol=0)
     with pytest.raises(ValueError, match="confidence"):
         Selector(SMALL)(View(batch.start), dataclasses.replace(batch, evidence=None))
