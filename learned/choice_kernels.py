@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from learned.bfloat16 import narrow
 from learned.elementary import logarithm
 from learned.jit import lanes, tasks
 from learned.view_kernels import inside
@@ -77,7 +78,7 @@ def describe_rows(first: int, last: int, states: np.ndarray, sources: np.ndarray
     least_jump, colour_scale, step_scale : float
         Jump of disparity below which there is nothing between; factors of differences of colour and of pixels.
     out : np.ndarray
-        (B, H, W, channels) float32.
+        (B, H, W, channels) float32, or uint16 for bfloat16.
     """
     count, (height, width), channels = states.shape[1], states.shape[3:], out.shape[3]
     rows = np.empty((channels, width), np.float32)
@@ -120,7 +121,7 @@ def describe_rows(first: int, last: int, states: np.ndarray, sources: np.ndarray
                 rows[channel + 2 + j, x] = np.float32(2) * votes[b, j, y, x] - np.float32(1)
         for x in range(width):
             for c in range(channels):
-                out[b, y, x, c] = rows[c, x]
+                out[b, y, x, c] = narrow(rows[c, x], out)
 
 
 @lanes

@@ -16,7 +16,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from learned.alternatives import kernels_may
-from learned.batch import Batch
+from learned.bfloat16 import to_array
 from learned.choice_kernels import describe_rows, extremes_along, extremes_down, votes_of_rows
 from learned.threads import over_tasks
 
@@ -128,33 +128,39 @@ def _take(maps: Tensor, sources: Tensor) -> Tensor:
     return maps.flatten(2).gather(2, picked).view(maps.shape)
 
 
-def describe(choices: Choices, batch: Batch) -> Tensor:
+def with_gradients(images: Tensor) -> Tensor:
+    """(B, 4, 5, H, W): colours of the images (B, 4, 3, H, W) and derivatives of their mean along x and y, all of about one."""
+    each = images.flatten(0, 1)
+    steps = [_GRADIENT * step for step in _gradients(each)]
+    return torch.cat([each, *steps], 1).unflatten(0, images.shape[:2])
+
+
+def describe(choices: Choices, seen: Tensor, evidence: Tensor) -> Tensor:
     """What speaks for each choice (B, DESCRIPTION, H, W), float32, in a range of about one.
 
-    Without a graph to build, on a CPU, kernels do it in one pass.
+    Without a graph to build, on a CPU, kernels do it in one pass, in autocast's type.
 
     Parameters
     ----------
     choices : Choices
-    batch : Batch
-        Its images, and its evidence: confidence and visibility.
+    seen : Tensor (B, 4, 5, H, W)
+        :func:`with_gradients`.
+    evidence : Tensor (B, 2, H, W)
+        Confidence and visibility of the start.
     """
-    if batch.evidence is None or batch.evidence.shape[1] != 2:
-        raise ValueError("choosing needs the start's confidence and visibility")
-    if kernels_may(choices.states) and kernels_may(batch.images):
-        return _describe_by_kernels(choices, batch.images, batch.evidence)
-    left1, evidence = batch.images[:, 0], batch.evidence
+    if kernels_may(choices.states) and kernels_may(seen):
+        return _describe_by_kernels(choices, seen, evidence)
+    own, left1 = seen[:, 0], seen[:, 0, :3]
     state = choices.states[:, 0]
     height, width = state.shape[-2:]
     y = torch.arange(height, device=state.device, dtype=state.dtype)[:, None]
     x = torch.arange(width, device=state.device, dtype=state.dtype)
-    seen = [torch.cat([image, *(_GRADIENT * each for each in _gradients(image))], 1) for image in batch.images.unbind(1)]
     front = _front(state[:, 0])
     parts = []
     for choice in choices.states.unbind(1):
         d1, _, change, u, v = choice.unbind(1)
         for there, at_x, at_y in ((1, x - d1, y), (2, x + u, y + v), (3, x + u - d1 - change, y + v)):
-            difference = (_sample(seen[there], at_x, at_y) - seen[0]).abs()
+            difference = (_sample(seen[:, there], at_x, at_y) - own).abs()
             parts += [_COLOUR * difference[:, :3].mean(1, keepdim=True).clamp(max=0.5),
                       difference[:, 3:].sum(1, keepdim=True).clamp(max=1)]  # fmt: skip
         hides = _sample(front[:, None], x - d1, y) - d1[:, None]
@@ -168,23 +174,22 @@ def describe(choices: Choices, batch: Batch) -> Tensor:
         away_y, away_x = source // width - y, source % width - x
         colour = (_take(left1, source) - left1).abs().mean(1, keepdim=True)
         parts += [away_y / (2 * _CLOSE_PX), away_x / (2 * _CLOSE_PX), _take(evidence[:, :1], source), _COLOUR * colour]
-    parts += [_GRADIENT * each for each in _gradients(left1)]
+    parts.append(own[:, 3:])
     parts.append(2 * _votes(left1, state[:, :1], evidence[:, :1], (farthest + nearest) / 2) - 1)
     return torch.cat(parts, 1)
 
 
-def _describe_by_kernels(choices: Choices, images: Tensor, evidence: Tensor) -> Tensor:
+def _describe_by_kernels(choices: Choices, seen: Tensor, evidence: Tensor) -> Tensor:
     """As `describe`, with channels innermost in memory."""
     states = choices.states.contiguous()
     count, _, _, height, width = states.shape
-    steps = [_GRADIENT * each for each in _gradients(images.flatten(0, 1))]
-    seen = torch.cat([images.flatten(0, 1), *steps], 1).unflatten(0, images.shape[:2]).flatten(3)
     middle = (states[:, 1, 0] + states[:, 2, 0]) / 2
-    votes = _votes_by_kernels(images[:, 0], states[:, 0, :1], evidence[:, :1], middle)
-    out = torch.empty((count, height, width, DESCRIPTION))
-    maps = states, choices.sources.contiguous(), seen, _front(states[:, 0, 0]), evidence.contiguous(), votes
+    votes = _votes_by_kernels(seen[:, 0, :3], states[:, 0, :1], evidence[:, :1], middle)
+    dtype = torch.get_autocast_dtype("cpu") if torch.is_autocast_enabled("cpu") else torch.float32
+    out = torch.empty((count, height, width, DESCRIPTION), dtype=dtype)
+    maps = states, choices.sources.contiguous(), seen.flatten(3), _front(states[:, 0, 0]), evidence.contiguous(), votes
     scales = (np.float32(each) for each in (_LEAST_JUMP_PX, _COLOUR, 1 / (2 * _CLOSE_PX)))
-    over_tasks(describe_rows, count * height, *(each.numpy() for each in maps), *scales, out.numpy())
+    over_tasks(describe_rows, count * height, *(each.numpy() for each in maps), *scales, to_array(out))
     return out.permute(0, 3, 1, 2)
 
 

@@ -65,7 +65,7 @@ def refine(
     if refiner.config.weighs_energies and steps > 0:
         assert oracle is not None
         camera_loss, _ = oracle.features(still(batch.start, batch.homography))
-    contrasts = refiner.contrasts(batch)
+    prepared = refiner.prepare(batch)
     states, reliabilities = [batch.start], []
     for t in range(steps + 1):
         loss = gradient = None
@@ -75,7 +75,7 @@ def refine(
             watch(t, states[-1], loss, gradient)
         if t < steps:
             state = states[-1].detach() if refiner.config.detached else states[-1]
-            update = refiner(View(state, loss, gradient, camera_loss, contrasts), batch)
+            update = refiner(View(state, loss, gradient, camera_loss, prepared), batch)
             states.append(state + update.change)
             reliabilities.append(update.reliability)
     return Refinement(states, reliabilities)

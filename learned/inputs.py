@@ -36,8 +36,8 @@ class View(NamedTuple):
     """(B, 5, H, W): of the energy."""
     camera_loss: Tensor | None = None
     """(B, H, W): the energy's map if everything followed the camera's motion."""
-    contrasts: Tensor | None = None
-    """(B, k, h, w): of left1, between neighbours."""
+    prepared: Tensor | None = None
+    """What G's own ``prepare`` has made of the images, once for all steps."""
 
 
 class Seen(NamedTuple):

@@ -138,8 +138,8 @@ class Refiner(nn.Module):
             nn.init.zeros_(layer.weight)
             nn.init.zeros_(layer.bias)  # type: ignore[arg-type]
 
-    def contrasts(self, batch: Batch) -> Tensor | None:
-        """What the images say about neighbours, for `View`; the same in every step."""
+    def prepare(self, batch: Batch) -> Tensor | None:
+        """(B, k, h, w): contrasts of left1 between neighbours, for `View`; the same in every step."""
         return self.neighbours.contrasts(self.grid.pick(batch.images[:, 0])) if self.config.neighbours else None
 
     def forward(self, view: View, batch: Batch) -> Update:
@@ -148,7 +148,8 @@ class Refiner(nn.Module):
         Parameters
         ----------
         view : View
-            Energy and gradient if they are inputs; with neighbours the contrasts, and the camera's energy if energy is an input.
+            Energy and gradient if they are inputs; with neighbours what was prepared, and the camera's energy if energy is an
+            input.
         batch : Batch
             Its images if they are an input, its evidence if that is one; with neighbours its backward flow and the camera's
             motion (without it, the state's own).
@@ -159,8 +160,8 @@ class Refiner(nn.Module):
         if not self.config.neighbours:
             return Update(self.grid.spread(correction.float(), (state.shape[-2], state.shape[-1])), None)
         reliability, preference, gates = self._heads(x)
-        assert view.contrasts is not None
-        mixture = self.neighbours.mixture(seen.picked, preference, view.contrasts, self.edge_sharpness, reliability)
+        assert view.prepared is not None
+        mixture = self.neighbours.mixture(seen.picked, preference, view.prepared, self.edge_sharpness, reliability)
         change = gated_change(state, Alternatives(mixture, seen.camera, seen.residual), correction, gates, self.grid)
         return Update(change, reliability.float())
 

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from learned.batch import Batch
-from learned.choices import CHOICES, DESCRIPTION, Choices, describe, find_choices
+from learned.choices import CHOICES, DESCRIPTION, Choices, describe, find_choices, with_gradients
 from learned.inputs import View
 from learned.refiner import Update, hidden_layers
 
@@ -70,15 +70,17 @@ class Selector(nn.Module):
         with torch.no_grad():
             self.logits.bias[0] = _FIRST_BIAS  # type: ignore[index]
 
-    def contrasts(self, batch: Batch) -> Tensor | None:
-        """Nothing: for `learned.hybrid.refine`."""
-        return None
+    def prepare(self, batch: Batch) -> Tensor:
+        """The images as all steps see them, for `learned.hybrid.refine`."""
+        return with_gradients(batch.images)
 
-    def weigh(self, state: Tensor, batch: Batch) -> tuple[Tensor, Choices]:
+    def weigh(self, state: Tensor, batch: Batch, prepared: Tensor | None = None) -> tuple[Tensor, Choices]:
         """Logits (B, CHOICES, H, W) and the choices that they are about."""
+        if batch.evidence is None or batch.evidence.shape[1] != 2:
+            raise ValueError("choosing needs the start's confidence and visibility")
         with torch.no_grad():
             choices = find_choices(state)
-            seen = describe(choices, batch)
+            seen = describe(choices, self.prepare(batch) if prepared is None else prepared, batch.evidence)
         return self.logits(self.hidden(seen.contiguous(memory_format=torch.channels_last))).float(), choices
 
     def forward(self, view: View, batch: Batch) -> Update:
@@ -87,11 +89,11 @@ class Selector(nn.Module):
         Parameters
         ----------
         view : View
-            Its state alone is looked at.
+            Its state, and what was prepared, if that was.
         batch : Batch
             With images and evidence.
         """
-        logits, choices = self.weigh(view.state, batch)
+        logits, choices = self.weigh(view.state, batch, view.prepared)
         probability, other = logits.softmax(1)[:, 1:].max(1)
         changes = (probability > self.config.sure) & (choices.step > self.config.least_jump_px)
         chosen = torch.where(changes, other + 1, 0)

@@ -8,7 +8,7 @@ import torch
 
 from learned.batch import Batch
 from learned.checkpoint import ModelCard, load, save
-from learned.choices import CHOICES, DESCRIPTION, _front, _votes, describe, find_choices
+from learned.choices import CHOICES, DESCRIPTION, _front, _votes, describe, find_choices, with_gradients
 from learned.hybrid import refine
 from learned.inputs import View
 from learned.selector import Selector, SelectorConfig, right, selection_loss
@@ -64,18 +64,22 @@ def test_kernels_say_what_torch_says(batch, spread, threads):
     state[:, :2].clamp_(min=0)
     kept = state.clone(), batch.images.clone()
     plain = find_choices(state)
-    expected = describe(plain, batch)
+    seen = with_gradients(batch.images)
+    expected = describe(plain, seen, batch.evidence)
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
     try:
         with torch.inference_mode():
             found = find_choices(state)
-            described = describe(found, batch)
+            described = describe(found, seen, batch.evidence)
+            with torch.autocast("cpu", torch.bfloat16):
+                halved = describe(found, seen, batch.evidence)
     finally:
         torch.set_num_threads(before)
     torch.testing.assert_close(found.sources, plain.sources, rtol=0, atol=0)
     torch.testing.assert_close(found.states, plain.states, rtol=0, atol=0)
     torch.testing.assert_close(described, expected, rtol=0, atol=2e-4)
+    torch.testing.assert_close(halved, described.bfloat16(), rtol=0, atol=0)
     torch.testing.assert_close((state, batch.images), kept, rtol=0, atol=0)
 
 
@@ -84,7 +88,7 @@ def test_where_nothing_is_a_number_kernels_stay_inside_the_image(batch):
         choices = find_choices(torch.full_like(batch.start, torch.nan))
         own = torch.arange(HEIGHT * WIDTH).view(HEIGHT, WIDTH)
         torch.testing.assert_close(choices.sources, own.expand_as(choices.sources))
-        assert describe(choices, batch).shape == (2, DESCRIPTION, HEIGHT, WIDTH)
+        assert describe(choices, with_gradients(batch.images), batch.evidence).shape == (2, DESCRIPTION, HEIGHT, WIDTH)
 
 
 def test_a_choice_that_the_images_confirm_looks_alike_everywhere():
@@ -100,7 +104,7 @@ def test_a_choice_that_the_images_confirm_looks_alike_everywhere():
     state = torch.zeros(1, 5, HEIGHT, WIDTH)
     state[:, 0], state[:, 2], state[:, 3] = d1, change, u
     evidence = torch.ones(1, 2, HEIGHT, WIDTH)
-    seen = describe(find_choices(state), Batch(images, evidence=evidence))
+    seen = describe(find_choices(state), with_gradients(images), evidence)
     assert seen.shape == (1, DESCRIPTION, HEIGHT, WIDTH)
     inner = seen[..., 2:-2, 12:-12]
     assert inner[:, :6].abs().max() < 1e-4  # the state's own differences: right1, left2, right2
@@ -108,7 +112,7 @@ def test_a_choice_that_the_images_confirm_looks_alike_everywhere():
     for channel, shift in ((0, 2), (3, 1), (2, 1)):
         wrong = state.clone()
         wrong[:, channel] += shift
-        differs = describe(find_choices(wrong), Batch(images, evidence=evidence))[..., 2:-2, 12:-12]
+        differs = describe(find_choices(wrong), with_gradients(images), evidence)[..., 2:-2, 12:-12]
         assert differs[:, :6].amax() > 0.2
 
 
