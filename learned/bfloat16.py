@@ -20,6 +20,11 @@ def to_array(tensor: Tensor) -> np.ndarray:
     return tensor.view(torch.int16).numpy().view(np.uint16) if tensor.dtype == torch.bfloat16 else tensor.numpy()
 
 
+def autocast_dtype(device: str, otherwise: torch.dtype) -> torch.dtype:
+    """The type that layers compute in on a kind of device: autocast's, or what they are given without it."""
+    return torch.get_autocast_dtype(device) if torch.is_autocast_enabled(device) else otherwise
+
+
 def widen(value: Any) -> Any:
     """In kernels: a value out of an array, as float32."""
     raise NotImplementedError("for kernels alone")

@@ -16,7 +16,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from learned.alternatives import kernels_may
-from learned.bfloat16 import to_array
+from learned.bfloat16 import autocast_dtype, to_array
 from learned.choice_kernels import describe_rows, extremes_along, extremes_down, votes_of_rows
 from learned.threads import over_tasks
 
@@ -138,7 +138,7 @@ def with_gradients(images: Tensor) -> Tensor:
 def describe(choices: Choices, seen: Tensor, evidence: Tensor) -> Tensor:
     """What speaks for each choice (B, DESCRIPTION, H, W), float32, in a range of about one.
 
-    Without a graph to build, on a CPU, kernels do it in one pass, in autocast's type.
+    Without a graph to build, on a CPU, kernels do it in one pass; where autocast says so, in bfloat16.
 
     Parameters
     ----------
@@ -185,8 +185,8 @@ def _describe_by_kernels(choices: Choices, seen: Tensor, evidence: Tensor) -> Te
     count, _, _, height, width = states.shape
     middle = (states[:, 1, 0] + states[:, 2, 0]) / 2
     votes = _votes_by_kernels(seen[:, 0, :3], states[:, 0, :1], evidence[:, :1], middle)
-    dtype = torch.get_autocast_dtype("cpu") if torch.is_autocast_enabled("cpu") else torch.float32
-    out = torch.empty((count, height, width, DESCRIPTION), dtype=dtype)
+    halved = autocast_dtype("cpu", torch.float32) == torch.bfloat16  # kernels know no other type of half the size
+    out = torch.empty((count, height, width, DESCRIPTION), dtype=torch.bfloat16 if halved else torch.float32)
     maps = states, choices.sources.contiguous(), seen.flatten(3), _front(states[:, 0, 0]), evidence.contiguous(), votes
     scales = (np.float32(each) for each in (_LEAST_JUMP_PX, _COLOUR, 1 / (2 * _CLOSE_PX)))
     over_tasks(describe_rows, count * height, *(each.numpy() for each in maps), *scales, to_array(out))

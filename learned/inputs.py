@@ -11,7 +11,7 @@ from torch import Tensor
 
 from learned.alternatives import Grid, camera_motion, kernels_may, second_pair
 from learned.batch import Batch
-from learned.bfloat16 import to_array
+from learned.bfloat16 import autocast_dtype, to_array
 from learned.threads import over_tasks
 from learned.view_kernels import GRADIENT_MOST, GRADIENT_SCALE, GROUPS, LOSS_MOST, LOSS_SCALE
 from learned.view_kernels import observe as view_kernel
@@ -60,7 +60,7 @@ def look(config: RefinerConfig, grid: Grid, view: View, batch: Batch) -> Seen:
     """
     picked = grid.pick(view.state)
     device = picked.device.type
-    dtype = torch.get_autocast_dtype(device) if torch.is_autocast_enabled(device) else picked.dtype
+    dtype = autocast_dtype(device, picked.dtype)
     needed = {"loss": view.loss, "gradient": view.gradient, "camera loss": view.camera_loss}
     complete = batch.homography is not None and all(needed[name] is not None for name in needed if name in config.layout)
     if config.neighbours and complete and kernels_may(picked) and dtype in (torch.float32, torch.bfloat16):

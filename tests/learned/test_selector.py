@@ -74,12 +74,15 @@ def test_kernels_say_what_torch_says(batch, spread, threads):
             described = describe(found, seen, batch.evidence)
             with torch.autocast("cpu", torch.bfloat16):
                 halved = describe(found, seen, batch.evidence)
+            with torch.autocast("cpu", torch.float16):  # which kernels do not know
+                whole = describe(found, seen, batch.evidence)
     finally:
         torch.set_num_threads(before)
     torch.testing.assert_close(found.sources, plain.sources, rtol=0, atol=0)
     torch.testing.assert_close(found.states, plain.states, rtol=0, atol=0)
     torch.testing.assert_close(described, expected, rtol=0, atol=2e-4)
     torch.testing.assert_close(halved, described.bfloat16(), rtol=0, atol=0)
+    torch.testing.assert_close(whole, described, rtol=0, atol=0)
     torch.testing.assert_close((state, batch.images), kept, rtol=0, atol=0)
 
 
